@@ -1,0 +1,289 @@
+"""Properties that every filter of the registry must have, in float32 and float64."""
+
+from __future__ import annotations
+
+import typing
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import jaxfilt as jf
+from jaxfilt.core import _filter
+from tests.registry import REGISTRY, T, params, series
+
+DTYPES = [jnp.float32, jnp.float64]
+NAMES = sorted(REGISTRY)
+both = pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
+every = pytest.mark.parametrize("name", NAMES)
+
+
+def tolerance(dtype):
+    return 1e-4 if dtype == jnp.float32 else 1e-10
+
+
+def skip_exempt(name, prop):
+    if prop in REGISTRY[name].exempt:
+        pytest.skip(REGISTRY[name].exempt[prop])
+
+
+def run(name, dtype, ys=None, **options):
+    example = REGISTRY[name]
+    ys = series(example, dtype) if ys is None else ys
+    return jf.filter(example.make(params(example, dtype)), ys, outputs=jf.everything, **example.options, **options)
+
+
+def assert_close(a, b, tol):
+    leaves_a, tree_a = jax.tree.flatten(a)
+    leaves_b, tree_b = jax.tree.flatten(b)
+    assert tree_a == tree_b
+    for x, y in zip(leaves_a, leaves_b, strict=True):
+        x, y = np.asarray(x), np.asarray(y)
+        np.testing.assert_allclose(x, y, rtol=0, atol=tol * max(1.0, np.abs(y).max(initial=0)))
+
+
+def test_every_public_factory_is_registered():
+    registered = {example.factory for example in REGISTRY.values()}
+    missing = []
+    for public in vars(jf).values():
+        if callable(public) and getattr(public, "__module__", "").startswith("jaxfilt."):
+            try:
+                returns = typing.get_type_hints(public).get("return")
+            except (TypeError, NameError):
+                continue
+            machinery = {jf.bind, jf.wrap}
+            if returns is jf.Filter and public not in registered and public not in machinery:
+                missing.append(public.__name__)
+    assert not missing, f"not in tests/registry.py: {missing}"
+
+
+def test_exemptions_are_reasoned(capsys):
+    listed = [(name, prop, why) for name in NAMES for prop, why in REGISTRY[name].exempt.items()]
+    with capsys.disabled():
+        for entry in listed:
+            print("\nexempt: {} from {}: {}".format(*entry), end="")
+    assert all(len(why) > 20 for *_, why in listed)
+
+
+@both
+@every
+def test_shapes_and_dtypes(name, dtype):
+    out = run(name, dtype)
+    n, m = out.mean.shape[1], REGISTRY[name].m
+    shapes = {
+        "mean": (T, n), "cov": (T, n, n), "innovation": (T, m), "innovation_cov": (T, m, m),
+        "nis": (T,), "log_lik": (T,), "status": (T,), "noise_cov": (T, m, m),
+    }  # fmt: skip
+    for field, shape in shapes.items():
+        if (got := getattr(out, field)) is not None:
+            assert got.shape == shape, field
+            assert got.dtype == (jnp.int32 if field == "status" else dtype), field
+    assert all(leaf.dtype == dtype for leaf in jax.tree.leaves((out.prediction,)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(out))
+
+
+@both
+@every
+def test_scan_equals_eager_steps_and_streams(name, dtype):
+    """lax.scan under jit, uncompiled steps, and two chunks with the state handed on give the same."""
+    example = REGISTRY[name]
+    filt, ys = example.make(params(example, dtype)), series(example, dtype)
+    options = dict(example.options)
+    key = options.get("key")
+    inputs = jf.inputs(ys, **options)
+    whole = jf.filter(filt, ys, **options)
+
+    def at(k):
+        return jax.tree.map(lambda leaf: leaf[k], inputs)
+
+    first = at(0) if key is None else at(0)._replace(key=jax.random.fold_in(key, 0))
+    state = start = filt.init(first)
+    infos = []
+    for k in range(4):
+        state, info = jf.step(filt, state, at(k))
+        infos.append(jf.summary(state, info))
+    stepped = jax.tree.map(lambda *xs: jnp.stack(xs), *infos)
+    assert_close(stepped, jax.tree.map(lambda x: x[:4], whole), tolerance(dtype))
+
+    split = [jax.tree.map(lambda leaf: leaf[part], inputs) for part in (slice(0, 5), slice(5, None))]
+    state, head = jf.scan(filt, start, split[0])
+    _, tail = jf.scan(filt, state, split[1])
+    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), head, tail)
+    assert_close(joined, whole, tolerance(dtype))
+
+
+@both
+@every
+def test_vmap_equals_loop(name, dtype):
+    example = REGISTRY[name]
+    filt, ys = example.make(params(example, dtype)), series(example, dtype, runs=3)
+    options = dict(example.options)
+    key = options.pop("key", None)
+    keys = None if key is None else jax.random.split(key, 3)
+    batched = jax.vmap(lambda y, k: jf.filter(filt, y, key=k, **options))(ys, keys)
+    for i in range(3):
+        one = jf.filter(filt, ys[i], key=None if keys is None else keys[i], **options)
+        assert_close(jax.tree.map(lambda x, i=i: x[i], batched), one, tolerance(dtype))
+
+
+@every
+def test_population_of_filters_is_a_vmap(name):
+    """A stacked filter is a bank of filters: vmap over the parameters themselves."""
+    example = REGISTRY[name]
+    base = params(example, jnp.float64)
+    population = jax.tree.map(lambda x: jnp.stack([x, x * 1.01]), base)
+    ys = series(example, jnp.float64)
+    filters = jax.vmap(example.make)(population)
+    batched = jax.vmap(lambda f: jf.filter(f, ys, **example.options))(filters)
+    assert_close(jax.tree.map(lambda x: x[0], batched), jf.filter(example.make(base), ys, **example.options), 1e-10)
+
+
+@both
+@every
+def test_all_true_mask_is_no_mask(name, dtype):
+    skip_exempt(name, "all_true_mask")
+    ys = series(REGISTRY[name], dtype)
+    masked = run(name, dtype, mask=np.ones(ys.shape, bool))
+    assert_close(masked, run(name, dtype), 1e-13 if dtype == jnp.float64 else 1e-6)
+
+
+@both
+@every
+def test_all_false_mask_is_prediction(name, dtype):
+    skip_exempt(name, "all_false_mask")
+    ys = jnp.full_like(series(REGISTRY[name], dtype), jnp.nan)  # what is absent may hold anything
+    out = run(name, dtype, ys=ys, mask=np.zeros(ys.shape, bool))
+    assert_close(out.mean, out.prediction.mean, 0)
+    if out.cov is not None:
+        assert_close(out.cov, out.prediction.cov, tolerance(dtype))
+    if out.log_lik is not None:
+        assert (out.log_lik == 0).all()
+    assert (out.innovation == 0).all()
+    assert ((out.status & int(jf.Status.MISSED)) != 0).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(out))
+
+
+@both
+@every
+def test_covariances_are_symmetric_to_the_bit_and_psd(name, dtype):
+    out = run(name, dtype)
+    for cov in (out.cov, out.prediction.cov, out.innovation_cov):
+        if cov is not None:
+            cov = np.asarray(cov)
+            assert (cov == np.swapaxes(cov, 1, 2)).all()
+            eigenvalues = np.linalg.eigvalsh(cov.astype(float))
+            eps = float(jnp.finfo(dtype).eps)
+            assert (eigenvalues[:, 0] >= -10 * cov.shape[1] * eps * eigenvalues[:, -1]).all()
+
+
+@every
+def test_no_retrace_with_new_parameters_and_data(name):
+    example = REGISTRY[name]
+    p, ys = params(example, jnp.float64), series(example, jnp.float64)
+    jf.filter(example.make(p), ys, **example.options)
+    before = _filter._cache_size()
+    jf.filter(example.make(jax.tree.map(lambda x: x * 1.001, p)), ys + 1.0, **example.options)
+    assert _filter._cache_size() == before
+
+
+@both
+@every
+def test_a_bad_value_is_flagged_and_other_runs_are_untouched(name, dtype):
+    """NaN in one run of a batch: that step is flagged, and the other runs are the same to the bit."""
+    example = REGISTRY[name]
+    filt, ys = example.make(params(example, dtype)), series(example, dtype, runs=3)
+    options = dict(example.options)
+    key = options.pop("key", None)
+    keys = None if key is None else jax.random.split(key, 3)
+    batch = jax.jit(jax.vmap(lambda y, k: jf.filter(filt, y, key=k, **options)))
+    clean, dirty = batch(ys, keys), batch(ys.at[1, 4, 0].set(jnp.nan).at[1, 7, 0].set(jnp.inf), keys)
+    bad = (np.asarray(dirty.status) & int(jf.Status.NONFINITE)) != 0
+    assert bad[1, 4]
+    assert bad[1, 7]
+    assert bad.sum() == 2
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(dirty))
+    for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(dirty), strict=True):
+        assert (np.asarray(a)[[0, 2]] == np.asarray(b)[[0, 2]]).all()
+    with pytest.raises(ValueError, match=r"ys\[4, 0\] is nan"):
+        jf.filter(filt, ys.at[1, 4, 0].set(jnp.nan)[1], key=key, **options)
+
+
+@every
+def test_wrong_dtype_or_shape_is_refused(name):
+    example = REGISTRY[name]
+    filt, ys = example.make(params(example, jnp.float64)), series(example, jnp.float64)
+    if "dtype" not in example.exempt:
+        with pytest.raises(TypeError, match=r"ys: is float32, but the filter's model is float64"):
+            jf.filter(filt, ys.astype(jnp.float32), **example.options)
+    with pytest.raises(TypeError, match=r"ys: expected a float array, got int"):
+        jf.filter(filt, ys.astype(jnp.int32), **example.options)
+    with pytest.raises(ValueError, match="ys: expected at least one sample"):
+        jf.filter(filt, ys[:0])
+    if "shape" not in example.exempt:
+        with pytest.raises(ValueError, match="ys: expected 2 components"):
+            jf.filter(filt, jnp.concatenate([ys, ys], axis=1), **example.options)
+
+
+def loss(example, p, ys):
+    out = jf.filter(example.make(p), ys, **example.options)
+    weights = jnp.sin(jnp.arange(out.mean.size, dtype=out.mean.dtype)).reshape(out.mean.shape)
+    total = jnp.sum(weights * out.mean)
+    return total if out.log_lik is None else total + jnp.sum(out.log_lik)
+
+
+@every
+def test_gradient_equals_central_differences(name):
+    """For every float parameter at three random points; forward = reverse."""
+    skip_exempt(name, "gradient")
+    example = REGISTRY[name]
+    base, unravel = ravel_pytree(params(example, jnp.float64))
+    ys = series(example, jnp.float64)
+
+    def f(v):
+        return loss(example, unravel(v), ys)
+
+    h = 3e-5
+    eye = jnp.eye(base.size)
+    both_modes = jax.jit(lambda v: (jax.grad(f)(v), jax.jacfwd(f)(v)))
+    differences = jax.jit(
+        # Fourth order, so that rounding rather than truncation limits it.
+        lambda v: jax.vmap(lambda e: (8 * (f(v + h * e) - f(v - h * e)) - (f(v + 2 * h * e) - f(v - 2 * h * e))) / (12 * h))(eye)
+    )
+    for seed in range(3):
+        v = base * (1 + 0.05 * jax.random.uniform(jax.random.key(seed), base.shape, minval=-1.0, maxval=1.0))
+        reverse, forward = both_modes(v)
+        numeric = differences(v)
+        scale = float(jnp.abs(numeric).max())
+        assert np.isfinite(reverse).all()
+        np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-11 * scale)
+        np.testing.assert_allclose(reverse, numeric, rtol=1e-6, atol=1e-6 * scale)
+
+
+@every
+def test_gradient_float32_close_to_float64(name):
+    skip_exempt(name, "gradient")
+    example = REGISTRY[name]
+    grads = []
+    for dtype in DTYPES:
+        g = jax.jit(jax.grad(lambda p, dtype=dtype: loss(example, p, series(example, jnp.float64).astype(dtype))))(
+            params(example, dtype)
+        )
+        grads.append(np.asarray(ravel_pytree(g)[0], float))
+    assert np.abs(grads[0] - grads[1]).max() <= 1e-3 * np.abs(grads[1]).max()
+
+
+@both
+@every
+def test_gradient_is_finite_when_everything_is_missed(name, dtype):
+    skip_exempt(name, "gradient")
+    example = REGISTRY[name]
+    ys = series(example, dtype)
+
+    def f(p):
+        out = jf.filter(example.make(p), ys, mask=np.zeros(ys.shape, bool), **example.options)
+        return jnp.sum(out.mean) + (0 if out.cov is None else jnp.sum(out.cov))
+
+    gradient = jax.jit(jax.grad(f))(params(example, dtype))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
