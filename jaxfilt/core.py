@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -25,7 +26,7 @@ PyTree = Any
 
 
 class Status(enum.IntFlag):
-    """What happened in a step, as bits of ``Info.status``: under ``jit`` nothing can raise, so trouble travels as data."""
+    """What happened in a step, as bits of ``Info.status``. Nothing can raise under ``jit``: trouble travels as data."""
 
     MISSED = 1  # no component of the sample was present
     GATED = 2  # the sample was refused by a gate
@@ -72,7 +73,7 @@ class Info(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """A recursive estimator. Each field is a ``jax.tree_util.Partial`` over a module-level function; see :func:`bind`."""
+    """A recursive estimator; each field is a ``jax.tree_util.Partial`` of a module-level function (:func:`bind`)."""
 
     init: Callable[[StepInput], PyTree]  # first input (shapes, dtype, key) -> state before the first prediction
     predict: Callable[[PyTree, StepInput], tuple[PyTree, Prediction]]
@@ -84,7 +85,7 @@ class Filter(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Static:
-    """A static option inside a filter's parameters: no leaf, compared and hashed by value so that rebuilds do not retrace."""
+    """A static option in a filter's parameters: no leaf, and compared by value so that a rebuild does not retrace."""
 
     value: Any
 
@@ -268,14 +269,17 @@ def mask_nan(ys: Any) -> tuple[Array, Array]:
 
 
 def intervals(times: Any, *, first: float) -> Array:
-    """Intervals ``dt (T,)`` of increasing time stamps (T,); ``first`` is the one before the first sample, in the same unit.
+    """Intervals ``dt (T,)`` of increasing time stamps (T,); ``first`` is the one before the first sample.
 
     Raises:
         ValueError: if the (concrete) time stamps do not increase.
     """
-    if is_concrete(times) and (np.diff(np.asarray(times)) <= 0).any():
-        k = int(np.argmax(np.diff(np.asarray(times)) <= 0)) + 1
-        raise ValueError(f"times: must increase, but times[{k}] <= times[{k - 1}]")
+    if is_concrete(times):
+        stamps = np.asarray(times, np.float64)
+        increases = stamps[1:] > stamps[:-1]  # false for NaN too
+        if not increases.all():
+            k = int(np.argmin(increases)) + 1
+            raise ValueError(f"times: must increase, but times[{k}] <= times[{k - 1}]")
     times = jnp.asarray(times)
     return jnp.concatenate([jnp.full((1,), first, times.dtype), jnp.diff(times)])
 
@@ -362,7 +366,8 @@ def _step(filt, state, inp, skip_prediction):
         if skip_prediction is not None:
             predicted = jax.tree.map(lambda a, b: jnp.where(skip_prediction, a, b), state, predicted)
             if filt.moments is not None:
-                prior = Prediction(*filt.moments(state), prediction.cross)
+                mean, cov = filt.moments(state)
+                prior = Prediction(mean, cov, prediction.cross)
                 prediction = jax.tree.map(lambda a, b: jnp.where(skip_prediction, a, b), prior, prediction)
         state, info = filt.update(predicted, inp)
         numbers = (info.mean, info.log_lik, None if info.cov is None else jnp.diagonal(info.cov))
@@ -383,7 +388,8 @@ def _check_float(name, x):
 
 
 def _check_same_dtype(name, x, dtype):
-    if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating):
+    # A weakly typed tracer was a Python number: it takes the other's dtype.
+    if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating) and not getattr(x, "weak_type", False):
         got = jax.dtypes.canonicalize_dtype(x.dtype)
         if got != dtype:
             raise TypeError(f"{name}: is {got}, but ys is {dtype}; convert one of them")

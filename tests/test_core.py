@@ -104,6 +104,15 @@ def _noise_update(p, state, inp):
     return draw, jf.Info(draw, None, inp.y, None, None, None, jnp.int32(0))
 
 
+def test_a_traced_python_number_takes_the_models_dtype():
+    P0 = np.eye(2, dtype=np.float32)
+    filt = jf.kalman(jf.models.constant_velocity(dt=1.0, q=0.1, r=25.0, m0=np.zeros(2, np.float32), P0=P0))
+    ys = np.ones((3, 1), np.float32)
+    traced = jax.jit(lambda dt, r: jf.filter(filt, ys, dt=dt, r_scale=r).mean)(0.5, 2.0)
+    assert traced.dtype == jnp.float32
+    np.testing.assert_allclose(traced, jf.filter(filt, ys, dt=0.5, r_scale=2.0).mean, rtol=1e-6)
+
+
 def test_keys_are_prefix_stable():
     """Step k draws from fold_in(key, k + 1): a longer series starts with the same draws."""
     filt = jf.bind((), _noise_init, _noise_predict, _noise_update)
@@ -115,7 +124,7 @@ def test_keys_are_prefix_stable():
 
 
 def test_smoothing_needs_the_prediction_and_a_covariance():
-    with pytest.raises(ValueError, match="outputs=jf.everything"):
+    with pytest.raises(ValueError, match=r"outputs=jf\.everything"):
         jf.rts(jf.filter(KALMAN, YS))
     filt = jf.bind((), _noise_init, _noise_predict, _noise_update)
     with pytest.raises(ValueError, match="cannot be smoothed"):

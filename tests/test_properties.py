@@ -107,7 +107,7 @@ def test_scan_equals_eager_steps_and_streams(name, dtype):
     stepped = jax.tree.map(lambda *xs: jnp.stack(xs), *infos)
     assert_close(stepped, jax.tree.map(lambda x: x[:4], whole), tolerance(dtype))
 
-    split = [jax.tree.map(lambda leaf: leaf[part], inputs) for part in (slice(0, 5), slice(5, None))]
+    split = [jax.tree.map(lambda leaf, part=part: leaf[part], inputs) for part in (slice(0, 5), slice(5, None))]
     state, head = jf.scan(filt, start, split[0])
     _, tail = jf.scan(filt, state, split[1])
     joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), head, tail)
@@ -183,9 +183,9 @@ def test_no_retrace_with_new_parameters_and_data(name):
     example = REGISTRY[name]
     p, ys = params(example, jnp.float64), series(example, jnp.float64)
     jf.filter(example.make(p), ys, **example.options)
-    before = _filter._cache_size()
+    before = _filter._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     jf.filter(example.make(jax.tree.map(lambda x: x * 1.001, p)), ys + 1.0, **example.options)
-    assert _filter._cache_size() == before
+    assert _filter._cache_size() == before  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @both
@@ -249,7 +249,9 @@ def test_gradient_equals_central_differences(name):
     both_modes = jax.jit(lambda v: (jax.grad(f)(v), jax.jacfwd(f)(v)))
     differences = jax.jit(
         # Fourth order, so that rounding rather than truncation limits it.
-        lambda v: jax.vmap(lambda e: (8 * (f(v + h * e) - f(v - h * e)) - (f(v + 2 * h * e) - f(v - 2 * h * e))) / (12 * h))(eye)
+        lambda v: jax.vmap(
+            lambda e: (8 * (f(v + h * e) - f(v - h * e)) - (f(v + 2 * h * e) - f(v - 2 * h * e))) / (12 * h)
+        )(eye)
     )
     for seed in range(3):
         v = base * (1 + 0.05 * jax.random.uniform(jax.random.key(seed), base.shape, minval=-1.0, maxval=1.0))

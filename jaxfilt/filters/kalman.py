@@ -84,7 +84,7 @@ def effective_dynamics(
     return F, Q, shift
 
 
-def input_term(B: Any, inp: StepInput) -> Array | None:
+def input_term(B: Any, inp: StepInput) -> Any:
     """B u, or what the function B gives."""
     if B is None:
         return None

@@ -63,7 +63,9 @@ def linear_gaussian(
     """
     given = {"F": F, "H": H, "Q": Q, "R": R, "m0": m0, "P0": P0, "B": B, "D": D, "S": S}
     dtype = common_dtype({name: x for name, x in given.items() if not callable(x)})
-    a = {name: x if x is None else aspartial(x) if callable(x) else jnp.asarray(x, dtype) for name, x in given.items()}
+    a: dict[str, Any] = {}
+    for name, x in given.items():
+        a[name] = aspartial(x) if callable(x) else None if x is None else jnp.asarray(x, dtype)
     if a["m0"].ndim != 1 or a["m0"].size == 0:
         raise ValueError(f"m0: expected shape (n,) with n >= 1, got {a['m0'].shape}")
     n = a["m0"].shape[0]
@@ -113,7 +115,9 @@ def check_shape(name: str, x: Array, shape: tuple[int | None, ...]) -> None:
     try:
         chex.assert_shape(x, shape)
     except AssertionError:
-        wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"
+        wanted = (
+            "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"
+        )
         raise ValueError(f"{name}: expected shape {wanted}, got {jnp.shape(x)}") from None
 
 
@@ -140,7 +144,8 @@ def check_covariance(name: str, x: Any) -> None:
     eigenvalues = np.linalg.eigvalsh(A)
     if eigenvalues[0] < -10 * len(A) * eps * size:
         raise ValueError(
-            f"{name}: expected a positive semidefinite matrix, got smallest eigenvalue {eigenvalues[0]:.3g} of {A.tolist()}"
+            f"{name}: expected a positive semidefinite matrix, "
+            f"got smallest eigenvalue {eigenvalues[0]:.3g} of {A.tolist()}"
         )
 
 

@@ -213,7 +213,7 @@ def test_square_root_survives_dyer_mcreynolds(dtype, goal):
     H = jnp.array([[1, 1, 1], [1, 1, 1 + d]], dtype)
     eye = jnp.eye(3, dtype=dtype)
     model = jf.models.linear_gaussian(eye, H, 0 * eye, d * d * jnp.eye(2, dtype=dtype), jnp.zeros(3, dtype), eye)
-    Hx = [[int(round(float(x) * 2**60)) for x in row] for row in np.asarray(H, float)]
+    Hx = [[round(float(x) * 2**60) for x in row] for row in np.asarray(H, float)]
     out = jf.filter(jf.sqrt_kalman(model), jnp.ones((1, 2), dtype), first_update_only=True)
     exact = _exact_posterior(Hx, float(d * d))
     error = np.linalg.norm(np.asarray(out.cov[0], float) - exact) / np.linalg.norm(exact)
@@ -229,7 +229,9 @@ def _exact_posterior(H_scaled, r):
 
     H = [[Fraction(x, 2**60) for x in row] for row in H_scaled]
     r = Fraction(r)
-    S = [[sum(a * b for a, b in zip(H[i], H[j], strict=True)) + (r if i == j else 0) for j in range(2)] for i in range(2)]
+    S = [
+        [sum(a * b for a, b in zip(H[i], H[j], strict=True)) + (r if i == j else 0) for j in range(2)] for i in range(2)
+    ]
     det = S[0][0] * S[1][1] - S[0][1] * S[1][0]
     inverse = [[S[1][1] / det, -S[0][1] / det], [-S[1][0] / det, S[0][0] / det]]
     return np.array(
@@ -379,14 +381,14 @@ def test_covariances_stay_unbatched_under_vmap():
     filt = jf.kalman(_cv(np.diag([100.0, 25.0]), 0.1))
     ys = jax.random.normal(jax.random.key(0), (5, 41, 1))
     mask = ~np.isin(np.arange(41), np.arange(20, 26))
-    axes = jf.Info(mean=0, cov=None, innovation=0, innovation_cov=None, nis=0, log_lik=0, status=0, noise_cov=None)
 
     def run(y):
         out = jf.filter(filt, y, mask=mask)
-        return out._replace(extra=None)
+        return (out.mean, out.log_lik), (out.cov, out.innovation_cov, out.noise_cov)
 
-    out = jax.vmap(run, out_axes=axes._replace(extra=None))(ys)  # refuses if cov were batched
-    assert out.cov.shape == (41, 2, 2)
+    (mean, _), (cov, *_) = jax.vmap(run, out_axes=(0, None))(ys)  # refuses a batched covariance
+    assert mean.shape == (5, 41, 2)
+    assert cov.shape == (41, 2, 2)
 
 
 def test_a_traced_negative_interval_is_flagged_and_the_estimate_stays_finite():

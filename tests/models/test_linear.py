@@ -51,7 +51,9 @@ def test_a_wrong_dtype_is_a_type_error_that_names_it(name, bad):
 
 
 def test_python_numbers_take_the_arrays_dtype():
-    model = jf.models.linear_gaussian([[1, 0.5], [0, 1]], [[1, 0]], [[1, 0], [0, 1]], [[2]], jnp.zeros(2, jnp.float32), [[1, 0], [0, 1]])
+    model = jf.models.linear_gaussian(
+        [[1, 0.5], [0, 1]], [[1, 0]], [[1, 0], [0, 1]], [[2]], jnp.zeros(2, jnp.float32), [[1, 0], [0, 1]]
+    )
     assert {leaf.dtype for leaf in jax.tree.leaves(model)} == {jnp.dtype(jnp.float32)}
 
 

@@ -1,0 +1,1 @@
+"""One package per system of the literature: its scenario, its run, and a README with published figures beside ours."""

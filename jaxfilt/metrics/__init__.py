@@ -1,0 +1,16 @@
+"""Errors, statistical consistency, and estimates over independent runs."""
+
+from jaxfilt.metrics.consistency import Consistency as Consistency
+from jaxfilt.metrics.consistency import Whiteness as Whiteness
+from jaxfilt.metrics.consistency import chi2_quantile as chi2_quantile
+from jaxfilt.metrics.consistency import chi2_region as chi2_region
+from jaxfilt.metrics.consistency import consistency as consistency
+from jaxfilt.metrics.consistency import nees as nees
+from jaxfilt.metrics.consistency import whiteness as whiteness
+from jaxfilt.metrics.errors import mse as mse
+from jaxfilt.metrics.errors import rmse as rmse
+from jaxfilt.metrics.errors import squared_error as squared_error
+from jaxfilt.metrics.estimates import Estimate as Estimate
+from jaxfilt.metrics.estimates import mean as mean
+from jaxfilt.metrics.estimates import ratio as ratio
+from jaxfilt.metrics.estimates import root_mean as root_mean

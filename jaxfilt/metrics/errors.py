@@ -1,0 +1,85 @@
+"""Estimation errors over time windows and components."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from jaxfilt.core import is_concrete
+
+Components = Sequence[int] | slice | None
+
+
+def squared_error(estimate: ArrayLike, truth: ArrayLike, *, components: Components = None) -> Array:
+    """The squared length of the error vector at each time.
+
+    Args:
+        estimate: (..., T, n).
+        truth: (..., T, n), the same shape.
+        components: the entries that make up the vector, as a sequence of indices or a slice; None = all n.
+
+    Returns:
+        (..., T), in the squared unit of the components. Divide by their number for the mean per axis.
+
+    Raises:
+        ValueError: different shapes.
+    """
+    if jnp.shape(estimate) != jnp.shape(truth):
+        raise ValueError(f"estimate: expected the shape of truth {jnp.shape(truth)}, got {jnp.shape(estimate)}")
+    error = _pick(jnp.asarray(estimate), components) - _pick(jnp.asarray(truth), components)
+    return jnp.sum(error * error, axis=-1)
+
+
+def mse(estimate: ArrayLike, truth: ArrayLike, *, components: Components = None, window: Any = None) -> Array:
+    """The mean over a time window of :func:`squared_error`.
+
+    In a Monte-Carlo score return this and let :func:`jaxfilt.metrics.root_mean` take the root over runs: a mean of
+    per-run RMSEs is another, smaller number.
+
+    Args:
+        estimate: (..., T, n).
+        truth: (..., T, n).
+        components: as in :func:`squared_error`.
+        window: ``(first, last)`` samples, both included (as in :func:`jaxfilt.simulate.gap_mask`), or a mask (T,) bool,
+            True = counted; None = all.
+
+    Returns:
+        (...), in the squared unit of the components. NaN where a traced mask counts no sample.
+
+    Raises:
+        ValueError: a (concrete) window that is empty or reaches beyond the series.
+    """
+    errors = squared_error(estimate, truth, components=components)
+    T = errors.shape[-1]
+    if window is None:
+        return jnp.mean(errors, axis=-1)
+    if isinstance(window, tuple):
+        first, last = window
+        if not 0 <= first <= last < T:
+            raise ValueError(f"window: expected 0 <= first <= last < {T}, got ({first}, {last})")
+        return jnp.mean(errors[..., first : last + 1], axis=-1)
+    if jnp.shape(window) != (T,) or window.dtype != np.dtype(bool):
+        raise ValueError(
+            f"window: expected (first, last) or a bool mask ({T},), got {window.dtype} {jnp.shape(window)}"
+        )
+    if is_concrete(window) and not np.asarray(window).any():
+        raise ValueError("window: the mask counts no sample")
+    window = jnp.asarray(window)
+    total = jnp.sum(jnp.where(window, errors, jnp.zeros((), errors.dtype)), axis=-1)
+    return total / window.sum().astype(errors.dtype)
+
+
+def rmse(estimate: ArrayLike, truth: ArrayLike, *, components: Components = None, window: Any = None) -> Array:
+    """The root of :func:`mse`, in the components' own unit; arguments as there."""
+    return jnp.sqrt(mse(estimate, truth, components=components, window=window))
+
+
+def _pick(x, components):
+    if components is None or isinstance(components, slice):
+        return x[..., components or slice(None)]
+    return x[..., np.asarray(components, np.int32)]

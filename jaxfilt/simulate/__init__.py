@@ -1,0 +1,8 @@
+"""Simulated trajectories, measurements and gaps."""
+
+from jaxfilt.simulate.gaps import gap_mask as gap_mask
+from jaxfilt.simulate.gaps import random_gap as random_gap
+from jaxfilt.simulate.gaps import random_loss as random_loss
+from jaxfilt.simulate.trajectories import Simulated as Simulated
+from jaxfilt.simulate.trajectories import measure as measure
+from jaxfilt.simulate.trajectories import simulate as simulate
