@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, StepInput, bind
-from jaxfilt.filters.common import check_measurement, decoupled, innovate, likelihood, masked_rows
-from jaxfilt.linalg import chol, scale_cov, solve_chol, solve_lower, sym
+from jaxfilt.core import Filter, Prediction, StepInput, bind
+from jaxfilt.filters.common import check_measurement, decoupled, masked_rows
+from jaxfilt.filters.update import joseph_update
+from jaxfilt.linalg import chol, scale_cov, solve_chol, sym
 from jaxfilt.models.linear import LinearGaussian, value
 
 
@@ -20,7 +21,7 @@ class Correlated(NamedTuple):
     (Anderson and Moore 1979, section 5.5): x' = (F - J H) x + J (y - D u) + w', Cov(w') = Q - J S'.
     """
 
-    shift: Array  # (n,) J (y - H m - D u)
+    shift: Array  # (n,) J (y - D u)
     JH: Array  # (n, n)
     JS: Array  # (n, n)
 
@@ -99,17 +100,25 @@ def propagate(F: Array, mean: Array, shift: Array | None, correlated: Correlated
     return out if shift is None else out + shift
 
 
+def measurement(model: LinearGaussian, inp: StepInput, mean: Array) -> tuple[Array, Array, Array]:
+    """``(H, R, predicted measurement)`` of an update."""
+    H = value(model.H, inp.u, inp.dt)
+    R = scale_cov(value(model.R, inp.u, inp.dt), inp.r_scale)
+    shift = input_term(model.D, inp)
+    return H, R, H @ mean if shift is None else H @ mean + shift
+
+
 def correlate(
-    model: LinearGaussian, inp: StepInput, H: Array, R: Array, mask: Array | None, nu: Array, gain_step: Array
+    model: LinearGaussian, inp: StepInput, H: Array, R: Array, innovation: Array, predicted_mean: Array
 ) -> Correlated | None:
-    """The memory for the next prediction. ``shift`` is J times the residual y - D u - 0: F - J H acts on the mean."""
+    """The memory for the next prediction, in which F - J H acts on the posterior mean."""
     if model.S is None:
         return None
     S = value(model.S, inp.u, inp.dt)
-    S = S if mask is None else jnp.where(mask[None, :], S, jnp.zeros((), S.dtype))
-    J = solve_chol(chol(decoupled(mask, R)), S.T).T
-    residual = nu + masked_rows(mask, H) @ gain_step  # y - D u over the present components
-    return Correlated(J @ residual, J @ masked_rows(mask, H), J @ S.T)
+    S = S if inp.mask is None else jnp.where(inp.mask[None, :], S, jnp.zeros((), S.dtype))
+    J = solve_chol(chol(decoupled(inp.mask, R)), S.T).T
+    H = masked_rows(inp.mask, H)
+    return Correlated(J @ (innovation + H @ predicted_mean), J @ H, J @ S.T)
 
 
 def _init(model, inp):
@@ -125,23 +134,9 @@ def _predict(model, state, inp):
 
 
 def _update(model, state, inp):
-    mean, P = state.mean, state.cov
-    H = value(model.H, inp.u, inp.dt)
-    R = scale_cov(value(model.R, inp.u, inp.dt), inp.r_scale)
-    shift = input_term(model.D, inp)
-    predicted = H @ mean if shift is None else H @ mean + shift
-    nu, mask, status = innovate(inp, predicted)
-    S = sym(H @ P @ H.T + R)
-    Hm = masked_rows(mask, H)
-    L = chol(decoupled(mask, S))
-    whitened = solve_lower(L, nu)
-    nis, log_lik, singular = likelihood(mask, L, whitened)
-    K = solve_chol(L, Hm @ P).T
-    A = jnp.eye(P.shape[0], dtype=P.dtype) - K @ Hm
-    cov = sym(A @ P @ A.T + K @ R @ K.T)
-    correction = K @ nu
-    info = Info(mean + correction, cov, nu, S, nis, log_lik, status | singular, noise_cov=R)
-    return KalmanState(info.mean, cov, correlate(model, inp, H, R, mask, nu, mean)), info
+    H, R, predicted = measurement(model, inp, state.mean)
+    info, cov = joseph_update(inp, state.mean, state.cov, predicted, H, R)
+    return KalmanState(info.mean, cov, correlate(model, inp, H, R, info.innovation, state.mean)), info
 
 
 def _moments(model, state):

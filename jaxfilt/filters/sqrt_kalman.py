@@ -7,19 +7,19 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, bind
-from jaxfilt.filters.common import decoupled, innovate, likelihood, masked_rows
+from jaxfilt.core import Filter, Prediction, bind
 from jaxfilt.filters.kalman import (
     Correlated,
     correlate,
     effective_dynamics,
     init_correlated,
     init_mean,
-    input_term,
+    measurement,
     propagate,
 )
-from jaxfilt.linalg import chol, scale_cov, scale_factor, solve_lower, sym, tria
-from jaxfilt.models.linear import LinearGaussian, value
+from jaxfilt.filters.update import array_update
+from jaxfilt.linalg import chol, scale_factor, sym, tria
+from jaxfilt.models.linear import LinearGaussian
 
 
 class SqrtKalmanState(NamedTuple):
@@ -75,28 +75,10 @@ def _predict(p, state, inp):
 
 
 def _update(p, state, inp):
-    model, mean, L = p.model, state.mean, state.chol
-    H = value(model.H, inp.u, inp.dt)
-    R = scale_cov(value(model.R, inp.u, inp.dt), inp.r_scale)
-    shift = input_term(model.D, inp)
-    predicted = H @ mean if shift is None else H @ mean + shift
-    nu, mask, status = innovate(inp, predicted)
-    m, n = H.shape
-    HL = H @ L
-    if mask is None and p.chol_R is not None:
-        L_R = scale_factor(p.chol_R, inp.r_scale)
-    else:
-        L_R = chol(decoupled(mask, R))
-    top = jnp.concatenate([masked_rows(mask, HL), L_R], axis=1)
-    bottom = jnp.concatenate([L, jnp.zeros((n, m), L.dtype)], axis=1)
-    array = tria(jnp.concatenate([top, bottom]))
-    L_S, KL, L_new = array[:m, :m], array[m:, :m], array[m:, m:]
-    whitened = solve_lower(L_S, nu)
-    nis, log_lik, singular = likelihood(mask, L_S, whitened)
-    new_mean = mean + KL @ whitened
-    S = sym(HL @ HL.T + R)
-    info = Info(new_mean, sym(L_new @ L_new.T), nu, S, nis, log_lik, status | singular, noise_cov=R)
-    return SqrtKalmanState(new_mean, L_new, correlate(model, inp, H, R, mask, nu, mean)), info
+    H, R, predicted = measurement(p.model, inp, state.mean)
+    L_R = None if p.chol_R is None else scale_factor(p.chol_R, inp.r_scale)
+    info, L = array_update(inp, state.mean, state.chol, predicted, H @ state.chol, R, L_R)
+    return SqrtKalmanState(info.mean, L, correlate(p.model, inp, H, R, info.innovation, state.mean)), info
 
 
 def _moments(p, state):
