@@ -71,6 +71,7 @@ def run(experiment: Experiment, options: Options, *, write_readme: bool = False)
     print(f"report: {report.write(options.out) / 'report.md'}\n", flush=True)
     if write_readme:
         report.write_readme(experiment.directory / "README.md")
+        report.write_headline(ROOT.parent / "README.md")
     return report
 
 

@@ -12,6 +12,7 @@ import re
 import resource
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -121,6 +122,7 @@ class Report:
         tables: in the order shown.
         figures: files that the experiment wrote into ``options.directory(name)``.
         findings: sentences on what the tables show, reproduced or not.
+        headline: the few of them that belong into the project's README.
         facts: what else is worth a line, as runs per second.
         provenance: how it was made; filled in by the runner with :func:`provenance`.
     """
@@ -130,6 +132,7 @@ class Report:
     tables: list[Table] = field(default_factory=list)
     figures: list[Path] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
+    headline: list[str] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -137,12 +140,12 @@ class Report:
         """The whole report."""
         parts = [f"# {self.title}"]
         if self.findings:
-            parts.append("\n".join(f"* {finding}" for finding in self.findings))
+            parts.append(_bullets(self.findings))
         for table in self.tables:
             parts.append(f"## {table.title}\n\n{self._table(table)}")
         parts += [f"![{Path(figure).stem}]({Path(figure).name})" for figure in self.figures]
         facts = {**self.facts, **self.provenance}
-        parts.append("## How it was made\n\n" + "\n".join(f"* {key}: {_shown(value)}" for key, value in facts.items()))
+        parts.append(f"## How it was made\n\n{_bullets(_facts(facts))}")
         return "\n\n".join(parts) + "\n"
 
     def to_console(self) -> str:
@@ -150,7 +153,7 @@ class Report:
         parts = [f"{self.title}\n{'=' * len(self.title)}"]
         parts += [f"{table.title}{self._caption(table, ' | ')}\n\n{table.text('simple')}" for table in self.tables]
         parts += [f"* {finding}" for finding in self.findings]
-        parts += [f"{key}: {_shown(value)}" for key, value in self.facts.items()]
+        parts += _facts(self.facts)
         return "\n\n".join(parts) + "\n"
 
     def to_json(self) -> dict[str, Any]:
@@ -168,8 +171,8 @@ class Report:
     def write_readme(self, path: Path) -> None:
         """Publishes the results in an experiment's README.
 
-        Replaces what stands between ``<!-- table: NAME -->`` and ``<!-- /table: NAME -->``, copies the figures into
-        ``figures/`` beside it and keeps the numbers in ``published.json`` for :func:`compare`.
+        Replaces what stands between ``<!-- table: NAME -->`` and ``<!-- /table: NAME -->``, and ``findings`` alike,
+        copies the figures into ``figures/`` beside it and keeps the numbers in ``published.json`` for :func:`compare`.
 
         Raises:
             ValueError: the README has a table that the report lacks, or a marker without its end.
@@ -177,18 +180,22 @@ class Report:
         text = path.read_text(encoding="utf-8")
         tables = {table.name: table for table in self.tables}
         for name in re.findall(r"<!-- table: (\S+) -->", text):
-            start, end = f"<!-- table: {name} -->", f"<!-- /table: {name} -->"
             if name not in tables:
                 raise ValueError(f"{path}: no table {name} in the report, which has {', '.join(tables) or 'none'}")
-            if text.count(start) != 1 or text.count(end) != 1 or text.index(end) < text.index(start):
-                raise ValueError(f"{path}: expected {start} once, and {end} once after it")
-            before, after = text[: text.index(start)], text[text.index(end) + len(end) :]
-            text = f"{before}{start}\n\n{self._table(tables[name])}\n\n{end}{after}"
+            text = _fill(path, text, f"table: {name}", self._table(tables[name]))
+        if "<!-- findings -->" in text:
+            text = _fill(path, text, "findings", _bullets([*self.findings, *_facts(self.facts)]))
         path.write_text(text, encoding="utf-8")
         _write_json(path.parent / "published.json", self.to_json())
         for figure in self.figures:
             (path.parent / "figures").mkdir(exist_ok=True)
             shutil.copy(figure, path.parent / "figures")
+
+    def write_headline(self, path: Path) -> None:
+        """Publishes the headline in the project's README, between the markers ``findings: NAME`` if it has them."""
+        text = path.read_text(encoding="utf-8")
+        if f"<!-- findings: {self.name} -->" in text:
+            path.write_text(_fill(path, text, f"findings: {self.name}", _bullets(self.headline)), encoding="utf-8")
 
     def _table(self, table: Table) -> str:
         caption = self._caption(table, "")
@@ -198,6 +205,22 @@ class Report:
         runs = f"{table.runs} runs, seed {self.provenance.get('seed', 0)}." if table.runs else ""
         caption = " ".join(part for part in (runs, table.note) if part)
         return prefix + caption if caption else ""
+
+
+def _fill(path: Path, text: str, marker: str, content: str) -> str:
+    """The text with what stands between ``<!-- MARKER -->`` and ``<!-- /MARKER -->`` replaced."""
+    start, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
+    if text.count(start) != 1 or text.count(end) != 1 or text.index(end) < text.index(start):
+        raise ValueError(f"{path}: expected {start} once, and {end} once after it")
+    return f"{text[: text.index(start)]}{start}\n\n{content}\n\n{text[text.index(end) :]}"
+
+
+def _bullets(sentences: Sequence[str]) -> str:
+    return "\n".join(f"* {sentence}" for sentence in sentences)
+
+
+def _facts(facts: dict[str, Any]) -> list[str]:
+    return [f"{key}: {_shown(value)}" for key, value in facts.items()]
 
 
 def provenance(options: Options, seconds: float) -> dict[str, Any]:

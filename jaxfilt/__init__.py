@@ -4,6 +4,7 @@ from jaxfilt import linalg as linalg
 from jaxfilt import metrics as metrics
 from jaxfilt import models as models
 from jaxfilt import simulate as simulate
+from jaxfilt import tune as tune
 from jaxfilt.core import Filter as Filter
 from jaxfilt.core import Info as Info
 from jaxfilt.core import Prediction as Prediction
@@ -21,6 +22,9 @@ from jaxfilt.core import scan as scan
 from jaxfilt.core import step as step
 from jaxfilt.core import summary as summary
 from jaxfilt.core import wrap as wrap
+from jaxfilt.filters import alpha_beta as alpha_beta
+from jaxfilt.filters import alpha_beta_gamma as alpha_beta_gamma
+from jaxfilt.filters import gains as gains
 from jaxfilt.filters import kalman as kalman
 from jaxfilt.filters import sqrt_kalman as sqrt_kalman
 from jaxfilt.montecarlo import Draw as Draw

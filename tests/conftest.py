@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import itertools
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
@@ -31,3 +34,23 @@ def _lenient() -> Iterator[None]:
 def lenient() -> Callable[[], contextlib.AbstractContextManager[None]]:
     """For code that is not ours, as the peers': ``with lenient(): ...`` promotes as JAX does by default."""
     return _lenient
+
+
+_finished = itertools.count(1)
+
+
+@pytest.fixture(autouse=True)
+def _release_programs() -> Iterator[None]:
+    """Drops compiled programs before they exhaust the process's memory maps.
+
+    Each program for the CPU holds hundreds of maps. Linux allows a process 65530 of them, beyond which XLA aborts.
+    """
+    yield
+    if next(_finished) % 10 == 0 and _memory_maps() > 25_000:
+        jax.clear_caches()
+        gc.collect()
+
+
+def _memory_maps() -> int:
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else 0
