@@ -39,10 +39,10 @@ reproduce-all: env
 	$(BIN)/python -m experiments run all --out $(OUT)
 
 test: env
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 test-all: env
-	$(BIN)/python -m pytest -n 2 -m 'slow or not slow'
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'slow or not slow'
 
 lint: env
 	$(BIN)/ruff check .

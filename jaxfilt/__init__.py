@@ -1,6 +1,7 @@
 """jaxfilt: recursive state estimators for JAX."""
 
 from jaxfilt import linalg as linalg
+from jaxfilt import maneuver as maneuver
 from jaxfilt import metrics as metrics
 from jaxfilt import models as models
 from jaxfilt import simulate as simulate
@@ -24,9 +25,16 @@ from jaxfilt.core import summary as summary
 from jaxfilt.core import wrap as wrap
 from jaxfilt.filters import alpha_beta as alpha_beta
 from jaxfilt.filters import alpha_beta_gamma as alpha_beta_gamma
+from jaxfilt.filters import cubature as cubature
+from jaxfilt.filters import extended as extended
 from jaxfilt.filters import gains as gains
+from jaxfilt.filters import imm as imm
 from jaxfilt.filters import kalman as kalman
+from jaxfilt.filters import sqrt_cubature as sqrt_cubature
+from jaxfilt.filters import sqrt_extended as sqrt_extended
 from jaxfilt.filters import sqrt_kalman as sqrt_kalman
+from jaxfilt.filters import sqrt_unscented as sqrt_unscented
+from jaxfilt.filters import unscented as unscented
 from jaxfilt.montecarlo import Draw as Draw
 from jaxfilt.montecarlo import MonteCarloResult as MonteCarloResult
 from jaxfilt.montecarlo import Scenario as Scenario
@@ -38,7 +46,15 @@ from jaxfilt.smooth import smooth as smooth
 from jaxfilt.wrappers import blend as blend
 from jaxfilt.wrappers import coast_inflated as coast_inflated
 from jaxfilt.wrappers import covariance_intersection as covariance_intersection
+from jaxfilt.wrappers import detected as detected
+from jaxfilt.wrappers import gain_floor as gain_floor
+from jaxfilt.wrappers import gated as gated
 from jaxfilt.wrappers import hold_last as hold_last
 from jaxfilt.wrappers import mean_of_recent as mean_of_recent
+from jaxfilt.wrappers import nearest_neighbor as nearest_neighbor
+from jaxfilt.wrappers import p_inflated as p_inflated
 from jaxfilt.wrappers import polynomial_fit as polynomial_fit
+from jaxfilt.wrappers import q_inflated as q_inflated
+from jaxfilt.wrappers import scan_inputs as scan_inputs
 from jaxfilt.wrappers import sinusoid_fit as sinusoid_fit
+from jaxfilt.wrappers import variable_dimension as variable_dimension

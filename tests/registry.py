@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from tests.examples import Example, T, linear
+from tests.examples import Example, T, adaptive, imm, linear, nonlinear
 
-REGISTRY: dict[str, Example] = {**linear.EXAMPLES}
+REGISTRY: dict[str, Example] = {**adaptive.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES}
 
 
 def series(example: Example, dtype, runs: int | None = None):

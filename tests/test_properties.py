@@ -18,7 +18,16 @@ from tests.registry import REGISTRY, T, params, series
 DTYPES = [jnp.float32, jnp.float64]
 NAMES = sorted(REGISTRY)
 both = pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
-every = pytest.mark.parametrize("name", NAMES)
+# One process runs all tests of a filter, so that they share its compiled functions.
+every = pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in NAMES])
+# The dearest properties of an example that shares its code with another one are left to `make test-all`.
+every_dear = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.xdist_group(name), *[pytest.mark.slow] * REGISTRY[name].twin])
+        for name in NAMES
+    ],
+)
 
 
 def tolerance(dtype):
@@ -28,13 +37,6 @@ def tolerance(dtype):
 def skip_exempt(name, prop):
     if prop in REGISTRY[name].exempt:
         pytest.skip(REGISTRY[name].exempt[prop])
-
-
-def run(name, dtype, ys=None, **options):
-    example = REGISTRY[name]
-    ys = series(example, dtype) if ys is None else ys
-    options = {**example.options, **options}
-    return jf.filter(example.make(params(example, dtype)), ys, outputs=jf.everything, **options)
 
 
 def assert_close(a, b, tol):
@@ -69,10 +71,55 @@ def test_exemptions_are_reasoned(capsys):
     assert all(len(why) > 20 for *_, why in listed)
 
 
+# Compiling is what these tests cost: each function here is compiled once for each filter and dtype, and serves several.
+
+
+@functools.cache
+def compiled(name, masked=True):
+    """``(params, ys (3, T, m), mask, keys) -> everything``, batched."""
+    example = REGISTRY[name]
+
+    def f(p, ys, mask, keys):
+        options = {**example.options, "mask": mask if masked else None}
+        return jax.vmap(
+            lambda y, k: jf.filter(example.make(p), y, outputs=jf.everything, **{**options, "key": k})
+        )(ys, keys)  # fmt: skip
+
+    return jax.jit(f)
+
+
+def keys_of(name):
+    key = REGISTRY[name].options.get("key")
+    return None if key is None else jax.random.split(key, 3)
+
+
+def mask_of(name):
+    example = REGISTRY[name]
+    return jnp.broadcast_to(jnp.asarray(example.options.get("mask", True)), (T, example.m))
+
+
+def batch(name, dtype, ys=None, mask=None, *, masked=True):
+    """Three runs of the example; ``masked=False`` without any mask."""
+    example = REGISTRY[name]
+    ys = series(example, dtype, runs=3) if ys is None else ys
+    mask = mask_of(name) if mask is None else mask
+    return compiled(name, masked)(params(example, dtype), ys, mask if masked else None, keys_of(name))
+
+
+def alone(name, dtype, i):
+    """Run i of the batch by itself."""
+    example = REGISTRY[name]
+    options = {**example.options, "mask": mask_of(name)}
+    if (keys := keys_of(name)) is not None:
+        options["key"] = keys[i]
+    return jf.filter(example.make(params(example, dtype)), series(example, dtype, runs=3)[i], **options)
+
+
 @both
 @every
-def test_shapes_and_dtypes(name, dtype):
-    out = run(name, dtype)
+def test_shapes_dtypes_and_covariances(name, dtype):
+    """Shapes and dtypes as promised, finite; covariances symmetric to the bit and PSD."""
+    out = jax.tree.map(lambda x: x[0], batch(name, dtype))
     n, m = out.mean.shape[1], REGISTRY[name].m
     shapes = {
         "mean": (T, n), "cov": (T, n, n), "innovation": (T, m), "innovation_cov": (T, m, m),
@@ -84,80 +131,85 @@ def test_shapes_and_dtypes(name, dtype):
             assert got.dtype == (jnp.int32 if field == "status" else dtype), field
     assert all(leaf.dtype == dtype for leaf in jax.tree.leaves((out.prediction,)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(out))
+    eps = float(jnp.finfo(dtype).eps)
+    for cov in (out.cov, out.prediction.cov, out.innovation_cov):
+        if cov is not None:
+            cov = np.asarray(cov)
+            assert (cov == np.swapaxes(cov, 1, 2)).all()
+            eigenvalues = np.linalg.eigvalsh(cov.astype(float))
+            assert (eigenvalues[:, 0] >= -10 * cov.shape[1] * eps * eigenvalues[:, -1]).all()
 
 
 @both
 @every
-def test_scan_equals_eager_steps_and_streams(name, dtype):
-    """lax.scan under jit, single steps (in float64 uncompiled ones), and two chunks with the state handed on agree."""
+def test_vmap_equals_loop(name, dtype):
+    batched = jax.vmap(jf.summary, (None, 0))(None, batch(name, dtype))
+    for i in range(3):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], batched), alone(name, dtype, i), tolerance(dtype))
+
+
+@both
+@every_dear
+def test_scan_equals_single_steps_and_streams(name, dtype):
+    """One scan, single steps (in float64 uncompiled ones), and two chunks with the state handed on agree."""
     example = REGISTRY[name]
     step = jf.step if dtype == jnp.float64 else jax.jit(jf.step)
-    filt, ys = example.make(params(example, dtype)), series(example, dtype)
-    options = dict(example.options)
-    key = options.get("key")
+    filt, ys = example.make(params(example, dtype)), series(example, dtype, runs=3)[0]
+    options = {**example.options, "mask": mask_of(name)}
+    if (keys := keys_of(name)) is not None:
+        options["key"] = keys[0]
     inputs = jf.inputs(ys, **options)
-    whole = jf.filter(filt, ys, **options)
+    whole = alone(name, dtype, 0)
 
     def at(k):
         return jax.tree.map(lambda leaf: leaf[k], inputs)
 
-    first = at(0) if key is None else at(0)._replace(key=jax.random.fold_in(key, 0))
+    first = at(0) if keys is None else at(0)._replace(key=jax.random.fold_in(keys[0], 0))
     state = start = filt.init(first)
     infos = []
-    for k in range(4):
+    for k in range(3):
         state, info = step(filt, state, at(k))
         infos.append(jf.summary(state, info))
     stepped = jax.tree.map(lambda *xs: jnp.stack(xs), *infos)
-    assert_close(stepped, jax.tree.map(lambda x: x[:4], whole), tolerance(dtype))
+    assert_close(stepped, jax.tree.map(lambda x: x[:3], whole), tolerance(dtype))
 
-    split = [jax.tree.map(lambda leaf, part=part: leaf[part], inputs) for part in (slice(0, 5), slice(5, None))]
+    half = T // 2
+    split = [jax.tree.map(lambda leaf, part=part: leaf[part], inputs) for part in (slice(0, half), slice(half, T))]
     state, head = jf.scan(filt, start, split[0])
     _, tail = jf.scan(filt, state, split[1])
     joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), head, tail)
     assert_close(joined, whole, tolerance(dtype))
 
 
-@both
-@every
-def test_vmap_equals_loop(name, dtype):
-    example = REGISTRY[name]
-    filt, ys = example.make(params(example, dtype)), series(example, dtype, runs=3)
-    options = dict(example.options)
-    key = options.pop("key", None)
-    keys = None if key is None else jax.random.split(key, 3)
-    batched = jax.vmap(lambda y, k: jf.filter(filt, y, key=k, **options))(ys, keys)
-    for i in range(3):
-        one = jf.filter(filt, ys[i], key=None if keys is None else keys[i], **options)
-        assert_close(jax.tree.map(lambda x, i=i: x[i], batched), one, tolerance(dtype))
-
-
-@every
+@every_dear
 def test_population_of_filters_is_a_vmap(name):
     """A stacked filter is a bank of filters: vmap over the parameters themselves."""
     example = REGISTRY[name]
     base = params(example, jnp.float64)
     population = jax.tree.map(lambda x: jnp.stack([x, x * 1.01]), base)
-    ys = series(example, jnp.float64)
+    ys = series(example, jnp.float64, runs=3)[0]
+    options = {**example.options, "mask": mask_of(name)}
+    if (keys := keys_of(name)) is not None:
+        options["key"] = keys[0]
     filters = jax.vmap(example.make)(population)
-    batched = jax.vmap(lambda f: jf.filter(f, ys, **example.options))(filters)
-    assert_close(jax.tree.map(lambda x: x[0], batched), jf.filter(example.make(base), ys, **example.options), 1e-10)
+    batched = jax.vmap(lambda f: jf.filter(f, ys, **options))(filters)
+    assert_close(jax.tree.map(lambda x: x[0], batched), alone(name, jnp.float64, 0), 1e-10)
 
 
 @both
 @every
 def test_all_true_mask_is_no_mask(name, dtype):
     skip_exempt(name, "all_true_mask")
-    ys = series(REGISTRY[name], dtype)
-    masked = run(name, dtype, mask=np.ones(ys.shape, bool))
-    assert_close(masked, run(name, dtype, mask=None), 1e-13 if dtype == jnp.float64 else 1e-6)
+    full = batch(name, dtype, mask=jnp.ones((T, REGISTRY[name].m), bool))
+    assert_close(full, batch(name, dtype, masked=False), 1e-13 if dtype == jnp.float64 else 1e-6)
 
 
 @both
 @every
 def test_all_false_mask_is_prediction(name, dtype):
     skip_exempt(name, "all_false_mask")
-    ys = jnp.full_like(series(REGISTRY[name], dtype), jnp.nan)  # what is absent may hold anything
-    out = run(name, dtype, ys=ys, mask=np.zeros(ys.shape, bool))
+    nothing = jnp.full((3, T, REGISTRY[name].m), jnp.nan, dtype)  # what is absent may hold anything
+    out = batch(name, dtype, nothing, jnp.zeros(nothing.shape[1:], bool))
     assert_close(out.mean, out.prediction.mean, 0)
     if out.cov is not None:
         assert_close(out.cov, out.prediction.cov, tolerance(dtype))
@@ -168,26 +220,14 @@ def test_all_false_mask_is_prediction(name, dtype):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(out))
 
 
-@both
-@every
-def test_covariances_are_symmetric_to_the_bit_and_psd(name, dtype):
-    out = run(name, dtype)
-    for cov in (out.cov, out.prediction.cov, out.innovation_cov):
-        if cov is not None:
-            cov = np.asarray(cov)
-            assert (cov == np.swapaxes(cov, 1, 2)).all()
-            eigenvalues = np.linalg.eigvalsh(cov.astype(float))
-            eps = float(jnp.finfo(dtype).eps)
-            assert (eigenvalues[:, 0] >= -10 * cov.shape[1] * eps * eigenvalues[:, -1]).all()
-
-
 @every
 def test_no_retrace_with_new_parameters_and_data(name):
     example = REGISTRY[name]
-    p, ys = params(example, jnp.float64), series(example, jnp.float64)
-    jf.filter(example.make(p), ys, **example.options)
+    p, ys = params(example, jnp.float64), series(example, jnp.float64, runs=3)[0]
+    options = {**example.options, "mask": mask_of(name)}
+    jf.filter(example.make(p), ys, **options)
     before = _filter._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
-    jf.filter(example.make(jax.tree.map(lambda x: x * 1.001, p)), ys + 1.0, **example.options)
+    jf.filter(example.make(jax.tree.map(lambda x: x * 1.001, p)), ys + 1.0, **options)
     assert _filter._cache_size() == before  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -196,12 +236,9 @@ def test_no_retrace_with_new_parameters_and_data(name):
 def test_a_bad_value_is_flagged_and_other_runs_are_untouched(name, dtype):
     """NaN in one run of a batch: that step is flagged, and the other runs are the same to the bit."""
     example = REGISTRY[name]
-    filt, ys = example.make(params(example, dtype)), series(example, dtype, runs=3)
-    options = dict(example.options)
-    key = options.pop("key", None)
-    keys = None if key is None else jax.random.split(key, 3)
-    batch = jax.jit(jax.vmap(lambda y, k: jf.filter(filt, y, key=k, **options)))
-    clean, dirty = batch(ys, keys), batch(ys.at[1, 4, 0].set(jnp.nan).at[1, 7, 0].set(jnp.inf), keys)
+    ys = series(example, dtype, runs=3)
+    dirty_ys = ys.at[1, 4, 0].set(jnp.nan).at[1, 7, 0].set(jnp.inf)
+    clean, dirty = batch(name, dtype, ys), batch(name, dtype, dirty_ys)
     bad = (np.asarray(dirty.status) & int(jf.Status.NONFINITE)) != 0
     assert bad[1, 4]
     assert bad[1, 7]
@@ -210,7 +247,7 @@ def test_a_bad_value_is_flagged_and_other_runs_are_untouched(name, dtype):
     for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(dirty), strict=True):
         assert (np.asarray(a)[[0, 2]] == np.asarray(b)[[0, 2]]).all()
     with pytest.raises(ValueError, match=r"ys\[4, 0\] is nan"):
-        jf.filter(filt, ys.at[1, 4, 0].set(jnp.nan)[1], key=key, **options)
+        jf.filter(example.make(params(example, dtype)), dirty_ys[1], **example.options)
 
 
 @every
@@ -250,12 +287,7 @@ def gradient(name):
     return jax.jit(jax.grad(objective(name)))
 
 
-def mask_of(name):
-    example = REGISTRY[name]
-    return jnp.broadcast_to(jnp.asarray(example.options.get("mask", True)), (T, example.m))
-
-
-@every
+@every_dear
 def test_gradient_equals_central_differences(name):
     """For every float parameter at three random points; forward = reverse."""
     skip_exempt(name, "differences")
@@ -286,7 +318,7 @@ def test_gradient_equals_central_differences(name):
         np.testing.assert_allclose(reverse, numeric, rtol=1e-6, atol=1e-6 * scale)
 
 
-@every
+@every_dear
 def test_gradients_in_single_precision_and_in_gaps(name):
     """float32 is close to float64; finite in both when everything is missed."""
     skip_exempt(name, "gradient")

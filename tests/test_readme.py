@@ -26,7 +26,11 @@ def test_the_code_of_the_readme_runs():
 
 
 def test_the_names_of_the_readme_exist():
-    rows = re.findall(r"^\| (?:Filters|Lost measurements|Smoothing|Models|Simulation|Tuning).*$", README, re.MULTILINE)
+    rows = re.findall(
+        r"^\| (?:Filters|Nonlinear|Maneuvers|Association|Lost|Smoothing|Models|Simulation|Tuning).*$",
+        README,
+        re.MULTILINE,
+    )
     for row in rows:
         for name in re.findall(r"`([a-z_0-9.]+)`", row):
             parts = name.removeprefix("jf.").split(".")

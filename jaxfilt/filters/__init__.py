@@ -2,5 +2,12 @@
 
 from jaxfilt.filters.alpha_beta import alpha_beta as alpha_beta
 from jaxfilt.filters.alpha_beta import alpha_beta_gamma as alpha_beta_gamma
+from jaxfilt.filters.extended import extended as extended
+from jaxfilt.filters.extended import sqrt_extended as sqrt_extended
+from jaxfilt.filters.imm import imm as imm
 from jaxfilt.filters.kalman import kalman as kalman
 from jaxfilt.filters.sqrt_kalman import sqrt_kalman as sqrt_kalman
+from jaxfilt.filters.unscented import cubature as cubature
+from jaxfilt.filters.unscented import sqrt_cubature as sqrt_cubature
+from jaxfilt.filters.unscented import sqrt_unscented as sqrt_unscented
+from jaxfilt.filters.unscented import unscented as unscented

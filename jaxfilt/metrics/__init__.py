@@ -1,8 +1,8 @@
 """Errors, statistical consistency, and estimates over independent runs."""
 
+from jaxfilt.chi2 import chi2_quantile as chi2_quantile
 from jaxfilt.metrics.consistency import Consistency as Consistency
 from jaxfilt.metrics.consistency import Whiteness as Whiteness
-from jaxfilt.metrics.consistency import chi2_quantile as chi2_quantile
 from jaxfilt.metrics.consistency import chi2_region as chi2_region
 from jaxfilt.metrics.consistency import consistency as consistency
 from jaxfilt.metrics.consistency import nees as nees

@@ -21,6 +21,7 @@ class Example(NamedTuple):
     m: int = 2
     options: dict[str, Any] = {}  # further arguments of jf.filter  # noqa: RUF012
     exempt: dict[str, str] = {}  # property -> reason  # noqa: RUF012
+    twin: bool = False  # shares its code with another example: its dearest properties are slow tests
 
 
 LINEAR = {

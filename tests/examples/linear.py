@@ -74,8 +74,8 @@ EXAMPLES: dict[str, Example] = {
     "alpha_beta": Example(jf.alpha_beta, _alpha_beta, _AB),
     "alpha_beta_gamma": Example(jf.alpha_beta_gamma, _alpha_beta_gamma, _ABG),
     "coast_inflated": _wrapped(jf.coast_inflated, _coast_inflated, factor=3.0),
-    "hold_last": _wrapped(jf.hold_last, _hold_last),
-    "mean_of_recent": _wrapped(jf.mean_of_recent, _mean_of_recent),
+    "hold_last": _wrapped(jf.hold_last, _hold_last)._replace(twin=True),
+    "mean_of_recent": _wrapped(jf.mean_of_recent, _mean_of_recent)._replace(twin=True),
     "polynomial_fit": _wrapped(jf.polynomial_fit, _polynomial_fit, forgetting=0.9),
     "sinusoid_fit": _wrapped(
         jf.sinusoid_fit,
@@ -84,5 +84,5 @@ EXAMPLES: dict[str, Example] = {
     ),
     "covariance_intersection": _wrapped(jf.covariance_intersection, _covariance_intersection, forgetting=0.9),
     "blend": _wrapped(jf.blend, _blend, exponent=2.0, floor=0.25),
-    "nested": _wrapped(jf.blend, _nested, factor=3.0),
+    "nested": _wrapped(jf.blend, _nested, factor=3.0)._replace(twin=True),
 }

@@ -1,0 +1,1 @@
+"""A random sine, tracked by extended and unscented Kalman filters."""

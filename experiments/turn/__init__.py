@@ -1,0 +1,1 @@
+"""A target that turns, tracked by an interacting multiple model estimator."""
