@@ -1,0 +1,1 @@
+"""A target that begins to accelerate: detecting it, and what to do then."""
