@@ -88,6 +88,17 @@ def value(matrix: Matrix, u: PyTree, dt: Array | None) -> Array:
     return matrix(u, dt) if callable(matrix) else matrix
 
 
+def measurement_covariance(r: Array, d: int) -> Array:
+    """R (d, d) of d measured axes from variances: a scalar, one per axis, or R itself.
+
+    Raises:
+        ValueError: another shape.
+    """
+    if r.shape not in ((), (d,), (d, d)):
+        raise ValueError(f"r: expected a scalar, shape ({d},) or ({d}, {d}), got {r.shape}")
+    return r if r.ndim == 2 else jnp.diag(jnp.broadcast_to(r, (d,)))
+
+
 def common_dtype(arrays: dict[str, Any]) -> np.dtype:
     """The one float dtype of the arrays in a dict; Python numbers and lists of them have none of their own.
 

@@ -15,7 +15,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import Static
-from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian
+from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian, measurement_covariance
 
 # The direction g of one step's noise for noise="piecewise", as powers dt^p / p!: by how many derivatives
 # the state holds. Constant acceleration over the interval for CV, an acceleration (jerk) increment for CA (CJ).
@@ -86,10 +86,8 @@ def _motion_model(order, dt, q, r, m0, P0, noise):
     q, r = jnp.asarray(q, dtype), jnp.asarray(r, dtype)
     if q.shape not in ((), (d,)):
         raise ValueError(f"q: expected a scalar or shape ({d},), got {q.shape}")
-    if r.shape not in ((), (d,), (d, d)):
-        raise ValueError(f"r: expected a scalar, shape ({d},) or ({d}, {d}), got {r.shape}")
     params = _Motion(jnp.asarray(dt, dtype), jnp.broadcast_to(q, (d,)), Static(order), Static(noise))
-    R = r if r.ndim == 2 else jnp.diag(jnp.broadcast_to(r, (d,)))
+    R = measurement_covariance(r, d)
     H = jnp.asarray(np.eye(d, order * d), dtype)
     return linear_gaussian(Partial(_transition, params), H, Partial(_process_noise, params), R, m0, P0)
 

@@ -11,7 +11,7 @@ from jax.tree_util import Partial
 
 from jaxfilt.core import is_concrete
 from jaxfilt.models.discretise import van_loan
-from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian
+from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian, measurement_covariance
 
 
 class _Singer(NamedTuple):
@@ -54,10 +54,8 @@ def singer(*, dt: Any, tau: Any, variance: Any, r: Any, m0: Any, P0: Any) -> Lin
     variance, r = jnp.asarray(variance, dtype), jnp.asarray(r, dtype)
     if variance.shape not in ((), (d,)):
         raise ValueError(f"variance: expected a scalar or shape ({d},), got {variance.shape}")
-    if r.shape not in ((), (d,), (d, d)):
-        raise ValueError(f"r: expected a scalar, shape ({d},) or ({d}, {d}), got {r.shape}")
     params = _Singer(jnp.asarray(dt, dtype), jnp.asarray(tau, dtype), jnp.broadcast_to(variance, (d,)))
-    R = r if r.ndim == 2 else jnp.diag(jnp.broadcast_to(r, (d,)))
+    R = measurement_covariance(r, d)
     H = jnp.asarray(np.eye(d, 3 * d), dtype)
     return linear_gaussian(Partial(_transition, params), H, Partial(_process_noise, params), R, m0, P0)
 

@@ -18,6 +18,7 @@ from jaxfilt.models.linear import (
     check_shape,
     common_dtype,
     linear_gaussian,
+    measurement_covariance,
 )
 from jaxfilt.models.nonlinear import Nonlinear, nonlinear
 
@@ -111,15 +112,14 @@ def _check(dt, q, r, m0, P0, n, omega=None, q_omega=None):
     m0 = jnp.asarray(m0, dtype)
     check_shape("m0", m0, (n,))
     r = jnp.asarray(r, dtype)
-    if r.shape not in ((), (2,), (2, 2)):
-        raise ValueError(f"r: expected a scalar, shape (2,) or (2, 2), got {r.shape}")
+    R = measurement_covariance(r, 2)
     scalars: dict[str, Any] = {"dt": dt, "omega": omega, "q": q, "q_omega": q_omega}
     for name, x in scalars.items():
         if x is not None:
             scalars[name] = jnp.asarray(x, dtype)
             check_shape(name, scalars[name], ())
     p = _Turn(**scalars)
-    return p, m0, r if r.ndim == 2 else jnp.diag(jnp.broadcast_to(r, (2,)))
+    return p, m0, R
 
 
 def _matrix(omega, dt):

@@ -11,7 +11,7 @@ from jaxfilt.core import Filter, Static, Status, Wrapped, flag, multiply, presen
 from jaxfilt.filters.common import decoupled
 from jaxfilt.linalg import chol, solve_lower
 from jaxfilt.wrappers.common import covariances, predict_measurement
-from jaxfilt.wrappers.window import advance, check_fit, empty, extrapolate, push, select
+from jaxfilt.wrappers.window import check_fit, extrapolate, init_window, predict_window, push, select
 
 _GRID = 20  # weights 1/20 .. 1
 
@@ -62,16 +62,7 @@ def covariance_intersection(
     max_age = 3 * window if max_age is None and isinstance(window, int) else max_age
     check_fit(window, degree, forgetting, max_age)
     params = _Params(filt, forgetting, Static(_Options(window, degree, max_age)))
-    return wrap(params, init=_init, predict=_predict, update=_update)
-
-
-def _init(p, inp):
-    return Wrapped(p.inner.init(inp), empty(p.options.value.window, inp.y))
-
-
-def _predict(p, s, inp):
-    inner, prediction = p.inner.predict(s.inner, inp)
-    return Wrapped(inner, advance(s.memory, inp.dt)), prediction
+    return wrap(params, init=init_window, predict=predict_window, update=_update)
 
 
 def _update(p, s, inp):

@@ -19,7 +19,7 @@ from jaxfilt.core import Filter, Static, Status, Wrapped, aspartial, flag, multi
 from jaxfilt.linalg import chol, solve_chol
 from jaxfilt.models.linear import check_positive
 from jaxfilt.wrappers.common import check_count, predict_measurement
-from jaxfilt.wrappers.window import Fit, advance, check_fit, empty, extrapolate, push, select
+from jaxfilt.wrappers.window import Fit, check_fit, extrapolate, init_window, predict_window, push, select
 
 # The grid of angular rates that a sinusoid is fitted at, relative to the filter's own estimate.
 _RATES = (0.6, 1.4, 33)
@@ -107,8 +107,8 @@ def polynomial_fit(
     options = _Options(window, degree, bool(weighted), max_age)
     return wrap(
         _Polynomial(filt, forgetting, Static(options)),
-        init=_init,
-        predict=_predict,
+        init=init_window,
+        predict=predict_window,
         update=_polynomial_update,
     )
 
@@ -154,19 +154,10 @@ def sinusoid_fit(
     options = _Options(window, 1, bool(weighted), max_age)
     return wrap(
         _Sinusoid(filt, rate, interval, Static(options)),
-        init=_init,
-        predict=_predict,
+        init=init_window,
+        predict=predict_window,
         update=_sinusoid_update,
     )
-
-
-def _init(p, inp):
-    return Wrapped(p.inner.init(inp), empty(p.options.value.window, inp.y))
-
-
-def _predict(p, s, inp):
-    inner, prediction = p.inner.predict(s.inner, inp)
-    return Wrapped(inner, advance(s.memory, inp.dt)), prediction
 
 
 def _polynomial_update(p, s, inp):

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import is_concrete
+from jaxfilt.core import Prediction, StepInput, Wrapped, is_concrete
 from jaxfilt.linalg import chol, solve_chol
 from jaxfilt.models.linear import check_positive
 from jaxfilt.wrappers.common import check_count
@@ -111,6 +111,17 @@ def extrapolate(window: Window, used: Array, degree: int, forgetting: Any = 1.0)
     reference = window.values[0]
     value = reference + jnp.sum(coefficients * (window.values - reference[None, :]), axis=0)
     return Fit(value, jnp.sum(coefficients**2, axis=0), used.any(axis=0))
+
+
+def init_window(p: Any, inp: StepInput) -> Wrapped:
+    """``init`` of a wrapper whose only memory is a window of ``p.options.value.window`` samples."""
+    return Wrapped(p.inner.init(inp), empty(p.options.value.window, inp.y))
+
+
+def predict_window(p: Any, s: Wrapped, inp: StepInput) -> tuple[Wrapped, Prediction]:
+    """``predict`` of such a wrapper: the samples age."""
+    inner, prediction = p.inner.predict(s.inner, inp)
+    return Wrapped(inner, advance(s.memory, inp.dt)), prediction
 
 
 def check_fit(window: Any, degree: Any, forgetting: Any, max_age: Any) -> None:
