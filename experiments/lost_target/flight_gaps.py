@@ -7,7 +7,6 @@ fixes around it, never the fix.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 import jaxfilt as jf
-from experiments.report import Cell, Entry
+from experiments.planar import in_parallel
 from jaxfilt import tune
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "glider_igc"
@@ -276,12 +275,6 @@ def estimates(noise: Noise, windows: Windows, *, quick: bool = False) -> dict[Ke
     return found | {(name, "none"): naive(name, *given) for name in NAIVE}
 
 
-def in_parallel(function, jobs):
-    # Nearly all the time goes into compiling a program for each job, which other threads can do meanwhile.
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        return list(pool.map(function, jobs))
-
-
 # --------------------------------------------------------------------------------------------------------- the scores
 
 
@@ -297,26 +290,3 @@ def score(out: Reported, windows: Windows, r: float) -> Scores:
         cov = np.asarray(out.cov)[rows, windows.last] + r * np.eye(2)
         nees = np.asarray(jf.metrics.nees(position[rows, windows.last], cov, windows.ys[rows, windows.last])) / 2
     return Scores((squared * windows.hidden).sum(axis=1), squared[rows, windows.last], after, nees)
-
-
-class Bootstrap:
-    """Errors over a group of gaps, with standard errors from resampled gaps: the fixes of one gap err together."""
-
-    def __init__(self, group: np.ndarray, rng: np.random.Generator, draws: int = 1000) -> None:
-        """``group`` (B,) bool: the windows that count."""
-        self.group = np.flatnonzero(group)
-        count = len(self.group)
-        self.weights = rng.multinomial(count, np.full(count, 1 / count), size=draws)  # (draws, count)
-
-    def draw(self, total: np.ndarray, count: np.ndarray, *, root: bool = True) -> np.ndarray:
-        """``sum(total) / sum(count)`` over the group, or its root: first as met, then of each resampled group."""
-        total, count = total[self.group].astype(float), count[self.group].astype(float)
-        values = np.append(total.sum() / count.sum(), (self.weights @ total) / (self.weights @ count))
-        return np.sqrt(values) if root else values
-
-    def cell(self, total: np.ndarray | None, count: np.ndarray, *, root: bool = True) -> Entry:
-        """A table's entry; nothing where the strategy does not define the quantity."""
-        if total is None:
-            return "-"
-        value, *draws = self.draw(total, count, root=root)
-        return Cell(value, np.std(draws, ddof=1))

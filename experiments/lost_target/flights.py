@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxfilt as jf
+from experiments.bootstrap import Bootstrap
 from experiments.lost_target import flight_figures as figures
 from experiments.lost_target.flight_gaps import (
     AFTER,
@@ -22,7 +23,6 @@ from experiments.lost_target.flight_gaps import (
     SPLIT,
     TESTS,
     TRAINING,
-    Bootstrap,
     Flight,
     Key,
     Noise,
@@ -31,12 +31,12 @@ from experiments.lost_target.flight_gaps import (
     Windows,
     cut,
     estimates,
-    in_parallel,
     learn,
     load,
     score,
     training_pieces,
 )
+from experiments.planar import in_parallel
 from experiments.report import Cell, Entry, Options, Table
 from jaxfilt import tune
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxfilt as jf
 from experiments.lost_target import flight_gaps, flights
-from experiments.report import Cell, Options
+from experiments.report import Options
 from jaxfilt import tune
 
 NOISE = {"q": 3.6, "r": 0.1}
@@ -112,15 +112,6 @@ def test_coasting_over_the_real_dropout_gets_ever_less_certain(windows):
     variance = np.trace(np.asarray(out.cov)[-1, gap], axis1=1, axis2=2)
     assert len(variance) == 144
     assert (np.diff(variance) > 0).all()
-
-
-def test_bootstrap_agrees_with_the_standard_error_of_a_mean():
-    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
-    group = flight_gaps.Bootstrap(np.ones(400, bool), np.random.default_rng(1), draws=4000)
-    cell = group.cell(values, np.ones(400), root=False)
-    assert isinstance(cell, Cell)
-    assert cell.value == pytest.approx(values.mean())
-    assert cell.se == pytest.approx(values.std() / 20, rel=0.05)
 
 
 def test_quick_form_gives_finite_tables_and_figures(tmp_path, monkeypatch):
