@@ -23,9 +23,11 @@ from jaxfilt.core import scan as scan
 from jaxfilt.core import step as step
 from jaxfilt.core import summary as summary
 from jaxfilt.core import wrap as wrap
+from jaxfilt.filters import adaptive_delayed_kalman as adaptive_delayed_kalman
 from jaxfilt.filters import alpha_beta as alpha_beta
 from jaxfilt.filters import alpha_beta_gamma as alpha_beta_gamma
 from jaxfilt.filters import cubature as cubature
+from jaxfilt.filters import delayed_kalman as delayed_kalman
 from jaxfilt.filters import extended as extended
 from jaxfilt.filters import gains as gains
 from jaxfilt.filters import imm as imm
@@ -35,6 +37,7 @@ from jaxfilt.filters import sqrt_extended as sqrt_extended
 from jaxfilt.filters import sqrt_kalman as sqrt_kalman
 from jaxfilt.filters import sqrt_unscented as sqrt_unscented
 from jaxfilt.filters import unscented as unscented
+from jaxfilt.models.delays import lag_inputs as lag_inputs
 from jaxfilt.montecarlo import Draw as Draw
 from jaxfilt.montecarlo import MonteCarloResult as MonteCarloResult
 from jaxfilt.montecarlo import Scenario as Scenario

@@ -5,9 +5,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from tests.examples import Example, T, adaptive, imm, linear, nonlinear
+from tests.examples import Example, T, adaptive, delayed, imm, linear, nonlinear
 
-REGISTRY: dict[str, Example] = {**adaptive.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES}
+REGISTRY: dict[str, Example] = {
+    **adaptive.EXAMPLES, **delayed.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES,
+}  # fmt: skip
 
 
 def series(example: Example, dtype, runs: int | None = None):

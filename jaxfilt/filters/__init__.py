@@ -2,6 +2,8 @@
 
 from jaxfilt.filters.alpha_beta import alpha_beta as alpha_beta
 from jaxfilt.filters.alpha_beta import alpha_beta_gamma as alpha_beta_gamma
+from jaxfilt.filters.delayed import adaptive_delayed_kalman as adaptive_delayed_kalman
+from jaxfilt.filters.delayed import delayed_kalman as delayed_kalman
 from jaxfilt.filters.extended import extended as extended
 from jaxfilt.filters.extended import sqrt_extended as sqrt_extended
 from jaxfilt.filters.imm import imm as imm

@@ -1,6 +1,9 @@
 """State-space models as pytrees."""
 
 from jaxfilt.models import sensors as sensors
+from jaxfilt.models.delays import delay_probabilities as delay_probabilities
+from jaxfilt.models.delays import success_probabilities as success_probabilities
+from jaxfilt.models.delays import with_lags as with_lags
 from jaxfilt.models.discretise import van_loan as van_loan
 from jaxfilt.models.linear import LinearGaussian as LinearGaussian
 from jaxfilt.models.linear import linear_gaussian as linear_gaussian

@@ -58,7 +58,7 @@ def linear_gaussian(
 
     Raises:
         ValueError: wrong shapes, or (concrete arrays) non-finite values or a Q, R, P0 that is asymmetric by more than
-            1e-8 relative or indefinite.
+            1e-8 relative or indefinite, or an S that no joint noise of this Q and R has.
         TypeError: integer arrays, or arrays of different float dtypes.
     """
     given = {"F": F, "H": H, "Q": Q, "R": R, "m0": m0, "P0": P0, "B": B, "D": D, "S": S}
@@ -80,6 +80,8 @@ def linear_gaussian(
             else:
                 check_finite(name, a[name])
     check_finite("m0", a["m0"])
+    if a["S"] is not None and not any(callable(a[name]) for name in ("Q", "R", "S")):
+        check_covariance("S, with Q and R", jnp.block([[a["Q"], a["S"]], [a["S"].T, a["R"]]]))
     return LinearGaussian(**a)
 
 

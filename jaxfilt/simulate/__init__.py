@@ -1,5 +1,8 @@
-"""Simulated trajectories, measurements and gaps."""
+"""Simulated trajectories, measurements, gaps and delays."""
 
+from jaxfilt.simulate.delays import Received as Received
+from jaxfilt.simulate.delays import deliver as deliver
+from jaxfilt.simulate.delays import draw_delays as draw_delays
 from jaxfilt.simulate.gaps import gap_mask as gap_mask
 from jaxfilt.simulate.gaps import random_gap as random_gap
 from jaxfilt.simulate.gaps import random_loss as random_loss
