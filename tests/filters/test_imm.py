@@ -370,6 +370,31 @@ def test_gradient_of_velocity_acceleration_and_turn_together():
     np.testing.assert_allclose(slopes[0], difference(values, h), rtol=1e-6)
 
 
+def known_turns(omega):
+    """Straight on, and turns at a known rate to the left and to the right."""
+    m0, P0 = np.array([0.0, 0, 1, 0]), np.diag([0.1, 0.1, 0.1, 0.1])
+    rates = (jnp.zeros_like(omega), omega, -omega)
+    filters = [jf.kalman(jf.models.known_turn(dt=0.1, omega=w, q=0.01, r=0.05, m0=m0, P0=P0)) for w in rates]
+    return jf.imm(filters, np.where(np.eye(3), 0.96, 0.02))
+
+
+def test_turn_rates_are_tunable():
+    """The likelihood's slope in the rate is right, at rate 0 too, and its minimum is near the rate of the data."""
+    _, ys = arc(120)
+
+    def nll(omega):
+        return -jf.filter(known_turns(omega), ys).log_lik.sum()
+
+    h = 1e-4
+    near = (jnp.array([0.0, 0.5, 1.2])[:, None] + h * STENCIL[None, :]).ravel()
+    rates = jnp.linspace(0.2, 2.0, 37)
+    both_at = jax.jit(jax.vmap(lambda w: jax.jvp(nll, (w,), (jnp.ones(()),))))
+    values, slopes = both_at(jnp.concatenate([near, rates]))
+    for i in range(0, 15, 5):
+        np.testing.assert_allclose(slopes[i], difference(values[i : i + 5], h), rtol=1e-6, atol=1e-6)
+    assert abs(float(rates[jnp.argmin(values[15:])]) - 1.0) <= 0.15  # the data turn at 1 rad/s
+
+
 def test_smoothing_reduces_the_error():
     """Of the mixture, over several runs; of equal models it is the smoother of their filter."""
     quiet, loud = (motion((q, 1.0), axes=2)[0] for q in (0.01, 1.0))
