@@ -1,5 +1,6 @@
 """jaxfilt: recursive state estimators for JAX."""
 
+from jaxfilt import fuzzy as fuzzy
 from jaxfilt import linalg as linalg
 from jaxfilt import maneuver as maneuver
 from jaxfilt import metrics as metrics
@@ -30,12 +31,17 @@ from jaxfilt.filters import cubature as cubature
 from jaxfilt.filters import delayed_kalman as delayed_kalman
 from jaxfilt.filters import extended as extended
 from jaxfilt.filters import gains as gains
+from jaxfilt.filters import hinf as hinf
 from jaxfilt.filters import imm as imm
 from jaxfilt.filters import kalman as kalman
+from jaxfilt.filters import mixed_hinf as mixed_hinf
+from jaxfilt.filters import riccati as riccati
 from jaxfilt.filters import sqrt_cubature as sqrt_cubature
 from jaxfilt.filters import sqrt_extended as sqrt_extended
 from jaxfilt.filters import sqrt_kalman as sqrt_kalman
+from jaxfilt.filters import sqrt_mixed_hinf as sqrt_mixed_hinf
 from jaxfilt.filters import sqrt_unscented as sqrt_unscented
+from jaxfilt.filters import theta_max as theta_max
 from jaxfilt.filters import unscented as unscented
 from jaxfilt.models.delays import lag_inputs as lag_inputs
 from jaxfilt.montecarlo import Draw as Draw
@@ -46,10 +52,16 @@ from jaxfilt.montecarlo import scenario as scenario
 from jaxfilt.smooth import Smoothed as Smoothed
 from jaxfilt.smooth import rts as rts
 from jaxfilt.smooth import smooth as smooth
+from jaxfilt.wrappers import FuzzyNoise as FuzzyNoise
 from jaxfilt.wrappers import blend as blend
 from jaxfilt.wrappers import coast_inflated as coast_inflated
 from jaxfilt.wrappers import covariance_intersection as covariance_intersection
+from jaxfilt.wrappers import covariance_matching as covariance_matching
 from jaxfilt.wrappers import detected as detected
+from jaxfilt.wrappers import fading_memory as fading_memory
+from jaxfilt.wrappers import fuzzy_noise as fuzzy_noise
+from jaxfilt.wrappers import fuzzy_noise_parameters as fuzzy_noise_parameters
+from jaxfilt.wrappers import fuzzy_scaled as fuzzy_scaled
 from jaxfilt.wrappers import gain_floor as gain_floor
 from jaxfilt.wrappers import gated as gated
 from jaxfilt.wrappers import hold_last as hold_last
@@ -58,6 +70,7 @@ from jaxfilt.wrappers import nearest_neighbor as nearest_neighbor
 from jaxfilt.wrappers import p_inflated as p_inflated
 from jaxfilt.wrappers import polynomial_fit as polynomial_fit
 from jaxfilt.wrappers import q_inflated as q_inflated
+from jaxfilt.wrappers import sage_husa as sage_husa
 from jaxfilt.wrappers import scan_inputs as scan_inputs
 from jaxfilt.wrappers import sinusoid_fit as sinusoid_fit
 from jaxfilt.wrappers import variable_dimension as variable_dimension

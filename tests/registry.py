@@ -5,10 +5,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from tests.examples import Example, T, adaptive, delayed, imm, linear, nonlinear
+from tests.examples import Example, T, adaptive, delayed, hinf, imm, linear, noise, nonlinear
 
 REGISTRY: dict[str, Example] = {
-    **adaptive.EXAMPLES, **delayed.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES,
+    **adaptive.EXAMPLES, **delayed.EXAMPLES, **hinf.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES,
+    **noise.EXAMPLES,
 }  # fmt: skip
 
 

@@ -6,6 +6,11 @@ from jaxfilt.filters.delayed import adaptive_delayed_kalman as adaptive_delayed_
 from jaxfilt.filters.delayed import delayed_kalman as delayed_kalman
 from jaxfilt.filters.extended import extended as extended
 from jaxfilt.filters.extended import sqrt_extended as sqrt_extended
+from jaxfilt.filters.hinf import hinf as hinf
+from jaxfilt.filters.hinf import mixed_hinf as mixed_hinf
+from jaxfilt.filters.hinf import riccati as riccati
+from jaxfilt.filters.hinf import sqrt_mixed_hinf as sqrt_mixed_hinf
+from jaxfilt.filters.hinf import theta_max as theta_max
 from jaxfilt.filters.imm import imm as imm
 from jaxfilt.filters.kalman import kalman as kalman
 from jaxfilt.filters.sqrt_kalman import sqrt_kalman as sqrt_kalman

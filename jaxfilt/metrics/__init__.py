@@ -14,3 +14,5 @@ from jaxfilt.metrics.estimates import Estimate as Estimate
 from jaxfilt.metrics.estimates import mean as mean
 from jaxfilt.metrics.estimates import ratio as ratio
 from jaxfilt.metrics.estimates import root_mean as root_mean
+from jaxfilt.metrics.performance import PredictorGains as PredictorGains
+from jaxfilt.metrics.performance import predictor_gains as predictor_gains

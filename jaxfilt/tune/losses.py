@@ -33,7 +33,8 @@ def innovation_nll(
 
     For a Gaussian filter a sample gives ``(nu' S^-1 nu + log det S + m log(2 pi)) / 2`` over its m present components;
     the constant ``m log(2 pi) / 2`` is kept. Samples do not count that are masked altogether, that hold an unmasked
-    NaN or infinite value, or that a gate refused: the loss cannot tune a gate, which could always refuse more.
+    NaN or infinite value, or that a gate refused: the loss cannot tune a gate, which could always refuse more. Inside a
+    gate it cannot be trusted with Q and R either, since a smaller S refuses more: let a refused sample cost a constant.
 
     Args:
         filt: the filter; it must define ``log_lik``.
