@@ -1,0 +1,1 @@
+"""A cut satellite position bridged by a car's other sensors."""

@@ -1,0 +1,1 @@
+"""Glider flights through gaps by turn models and IMM."""

@@ -1,0 +1,1 @@
+"""Two boats seen by a ship's radar and lidar, in clutter."""

@@ -1,0 +1,1 @@
+"""Vessels tracked by the positions in their AIS reports."""
