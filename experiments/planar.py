@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -221,7 +221,7 @@ def np_params(params: Mapping[str, Any]) -> dict[str, Any]:
     return {key: np.asarray(value) for key, value in params.items()}
 
 
-def in_parallel(function, jobs: Sequence):
+def in_parallel(function, jobs: Iterable):
     """``[function(job) for job in jobs]``. Nearly all the time goes into compiling, which two threads can share."""
     with ThreadPoolExecutor(max_workers=2) as pool:
         return list(pool.map(function, jobs))

@@ -12,10 +12,12 @@ import jaxfilt as jf
 from experiments.lost_target import figures, scenarios
 from experiments.lost_target.flights import flights
 from experiments.lost_target.scenarios import G1, G2, Gap
+from experiments.lost_target.sine_gap import sine_gap
 from experiments.lost_target.tuning import tuning
+from experiments.lost_target.turn_gap import turn_gap
 from experiments.report import Cell, Entry, Options, Report, Table, peak_memory
 
-TITLE = "A target lost for a part of its path: G1, G2, tuning side by side, glider flights"
+TITLE = "A target lost for a part of its path: G1 to G4, tuning side by side, glider flights"
 MAIN = True
 
 ACCELERATION = 0.5  # m/s^2, of the target that the constant-velocity filter does not model
@@ -199,11 +201,13 @@ def run(options: Options) -> Report:
     report.findings = list(report.headline)
     directory = options.directory(report.name)
     report.figures = [figures.course(regimes(), results, directory / "gap_errors.png")]
-    for part in (tuning, flights):
+    # The first sentence of each of G3 and G4 belongs into the project's README.
+    for part, foremost in ((sine_gap, 1), (turn_gap, 1), (tuning, 0), (flights, 0)):
         more, paths, sentences = part(options)
         report.tables += more
         report.figures += [Path(path) for path in paths]
         report.findings += sentences
+        report.headline += sentences[:foremost]
     bits = {name: result.status for name, result in results.items()}
     bad = sum(int(((words & ~_EXPECTED) != 0).sum()) for status in bits.values() for words in status.values())
     report.facts["runs with a status bit other than MISSED and PSEUDO"] = bad

@@ -43,11 +43,16 @@ def path() -> np.ndarray:
     return np.array(states)
 
 
+def modes(r: Any) -> tuple[jf.Filter, jf.models.Nonlinear]:
+    """The manual's straight mode as a filter, and its turning mode as a model; r: variance of a measurement."""
+    m0, P0 = np.array([0.0, 0.0, 1.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.1, 0.1, 1.0])
+    straight = jf.kalman(jf.models.constant_velocity(dt=DT, q=0.01, r=r, m0=m0[:4], P0=P0[:4, :4]))
+    return straight, jf.models.coordinated_turn(dt=DT, q_omega=0.15, r=r, m0=m0, P0=P0)
+
+
 def filters() -> dict[str, jf.Filter]:
     """The manual's filters with its `zero` mixing, and with `own`."""
-    m0, P0 = np.array([0.0, 0.0, 1.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.1, 0.1, 1.0])
-    straight = jf.kalman(jf.models.constant_velocity(dt=DT, q=0.01, r=R, m0=m0[:4], P0=P0[:4, :4]))
-    turn = jf.models.coordinated_turn(dt=DT, q_omega=0.15, r=R, m0=m0, P0=P0)
+    straight, turn = modes(R)
     single = jf.models.constant_velocity(
         dt=DT, q=0.05, r=R, m0=np.array([0.0, 0.0, 0.0, -1.0]), P0=np.diag([1.1, 1.1, 0.1, 0.1])
     )
@@ -60,9 +65,9 @@ def filters() -> dict[str, jf.Filter]:
     return {"KF (CV)": jf.kalman(single), **bank}
 
 
-def draw(states: Array, key: Array) -> jf.Draw:
-    """The same path with fresh measurement noise."""
-    ys = states[:, :2] + jnp.sqrt(R) * jax.random.normal(key, (T, 2), states.dtype)
+def draw(states: Array, key: Array, r: Any = R) -> jf.Draw:
+    """The same path with fresh measurement noise of variance r."""
+    ys = states[:, :2] + jnp.sqrt(r) * jax.random.normal(key, (T, 2), states.dtype)
     return jf.Draw(states, ys)
 
 
