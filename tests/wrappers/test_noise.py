@@ -453,29 +453,45 @@ def test_bursts_about_as_long_as_the_window():
 # Protocol
 
 
-def test_the_wrappers_nest_and_go_around_any_filter_and_into_an_imm():
-    """Three of them around different filters of one linear model; and an IMM of equals is one of them."""
+def nested(inner):
+    return jf.sage_husa(jf.covariance_matching(jf.fuzzy_noise(inner, ROBUST), scale="q", window=4), forgetting=0.9)
+
+
+LINEAR = jf.models.linear_gaussian(F, H, Q, R, MODEL.m0, MODEL.P0)
+
+
+@pytest.mark.parametrize(
+    "inner",
+    [
+        jf.sqrt_kalman(LINEAR),
+        pytest.param(jf.extended(jf.models.as_nonlinear(LINEAR)), marks=pytest.mark.slow),
+        pytest.param(jf.unscented(jf.models.as_nonlinear(LINEAR)), marks=pytest.mark.slow),
+        pytest.param(jf.mixed_hinf(LINEAR, 0.0), marks=pytest.mark.slow),
+    ],
+    ids=["sqrt_kalman", "extended", "unscented", "mixed_hinf"],
+)
+def test_the_wrappers_nest_and_go_around_any_filter(inner):
+    """Three of them around different filters of one linear model."""
     ys = simulate(r=4.0, runs=1, steps=20, seed=11)[1][0]
-
-    def nested(inner):
-        return jf.sage_husa(jf.covariance_matching(jf.fuzzy_noise(inner, ROBUST), scale="q", window=4), forgetting=0.9)
-
-    linear = jf.models.linear_gaussian(F, H, Q, R, MODEL.m0, MODEL.P0)
-    expected = jf.filter(nested(jf.kalman(linear)), ys)
+    expected = jf.filter(nested(jf.kalman(LINEAR)), ys)
     assert {"r_scale", "q_scale"} <= expected.extra.keys()
     assert np.ptp(np.asarray(expected.extra["q_scale"])) > 0.1
-    general = jf.models.as_nonlinear(linear)
-    filters = [jf.sqrt_kalman(linear), jf.extended(general), jf.unscented(general), jf.mixed_hinf(linear, 0.0)]
-    for inner in filters:
-        out = jf.filter(nested(inner), ys)
-        np.testing.assert_allclose(out.mean, expected.mean, rtol=1e-6, atol=1e-7)
-        np.testing.assert_allclose(out.extra["r_scale"], expected.extra["r_scale"], rtol=1e-6)
-    pair = jf.imm([nested(jf.kalman(linear)), nested(jf.kalman(linear))], [[0.9, 0.1], [0.2, 0.8]])
-    out = jf.filter(pair, ys)
-    np.testing.assert_allclose(out.mean, expected.mean, rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(out.extra["models"][0]["r_scale"], expected.extra["r_scale"], rtol=1e-9)
-    around = jf.filter(jf.sage_husa(jf.imm([jf.kalman(linear)] * 2, [[0.9, 0.1], [0.2, 0.8]])), ys)
-    alone = jf.filter(jf.sage_husa(jf.kalman(linear)), ys)
+    out = jf.filter(nested(inner), ys)
+    np.testing.assert_allclose(out.mean, expected.mean, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(out.extra["r_scale"], expected.extra["r_scale"], rtol=1e-6)
+
+
+def test_into_an_imm_and_around_one():
+    """An IMM of equals is one of them."""
+    ys = simulate(r=4.0, runs=1, steps=20, seed=11)[1][0]
+    transition = [[0.9, 0.1], [0.2, 0.8]]
+    plain = jf.kalman(LINEAR)
+    wrapped = jf.sage_husa(plain)
+    alone = jf.filter(wrapped, ys)
+    out = jf.filter(jf.imm([wrapped] * 2, transition), ys)
+    np.testing.assert_allclose(out.mean, alone.mean, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(out.extra["models"][0]["r_scale"], alone.extra["r_scale"], rtol=1e-9)
+    around = jf.filter(jf.sage_husa(jf.imm([plain] * 2, transition)), ys)
     np.testing.assert_allclose(around.mean, alone.mean, rtol=1e-9, atol=1e-10)
 
 
