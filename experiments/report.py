@@ -16,9 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, SupportsFloat
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 
 from tabulate import tabulate
+
+if TYPE_CHECKING:
+    from jaxfilt.metrics import Estimate  # `list` answers at once without it
 
 PACKAGES = ("jaxfilt", "jax", "jaxlib", "numpy", "optax", "scipy", "pymoo")
 
@@ -60,6 +63,11 @@ class Cell:
     se: SupportsFloat | None = None
     digits: int = 3
     exact: bool = False
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> Cell:
+        """The cell of an estimate over runs."""
+        return cls(float(estimate.value), float(estimate.standard_error))
 
     def __str__(self) -> str:
         value = float(self.value)

@@ -197,7 +197,7 @@ def table(results: dict[str, dict[str, Loop]]) -> Table:
     for name in next(iter(scores.values())):
         row: list[Entry] = [name]
         for own in scores.values():
-            row += [_cell(jf.metrics.root_mean(own[name][part])) for part in parts]
+            row += [Cell.of(jf.metrics.root_mean(own[name][part])) for part in parts]
         rows.append(row)
     header = ["command from", *(f"{title}, {direction}" for direction in scores for title in parts.values())]
     loops = next(iter(results.values()))
@@ -214,7 +214,7 @@ def findings(results: dict[str, dict[str, Loop]]) -> list[str]:
     """What the table says."""
     parts = []
     rms = {
-        direction: {name: str(_cell(jf.metrics.root_mean(own["h"]))) for name, own in mean_squares(loops).items()}
+        direction: {name: str(Cell.of(jf.metrics.root_mean(own["h"]))) for name, own in mean_squares(loops).items()}
         for direction, loops in results.items()
     }
     for direction, own in rms.items():
@@ -232,10 +232,6 @@ def findings(results: dict[str, dict[str, Loop]]) -> list[str]:
         "model holds only for a command that follows the true state without error and without being held over a "
         "sample.",
     ]
-
-
-def _cell(estimate: jf.metrics.Estimate) -> Cell:
-    return Cell(float(estimate.value), float(estimate.standard_error))
 
 
 def run(runs: int, seed: int) -> dict[str, dict[str, Loop]]:

@@ -37,10 +37,6 @@ def simulate(options: Options) -> tuple[Results, jf.MonteCarloResult, Results]:
     return table3, run(scenarios.with_input("printed")), {name: run(s) for name, s in scenarios.limits().items()}
 
 
-def _cell(estimate: jf.metrics.Estimate) -> Cell:
-    return Cell(float(estimate.value), float(estimate.standard_error))
-
-
 def _windows(result: jf.MonteCarloResult) -> list[int]:
     return [window for window in WINDOWS if adaptive_name(window, MODES[0]) in result.scores]
 
@@ -56,7 +52,7 @@ def main_table(name: str, title: str, result: jf.MonteCarloResult, setup: Setup,
         for index, part in enumerate(("h", "hdot")):
             if published:
                 row.append("" if paper is None else f"{paper[index]:g}")
-            row += [_cell(result.mean(f"{short}, {mode}", part)) for mode in MODES]
+            row += [Cell.of(result.mean(f"{short}, {mode}", part)) for mode in MODES]
         rows.append(row)
     paper_column = ["paper, {}"] if published else []
     header = ["filter"]
@@ -78,9 +74,9 @@ def baseline_table(results: Results) -> Table:
         row: list[Entry] = [name]
         for result in results.values():
             if name == "hold":
-                row += [_cell(result.mean("kf_flag", "hold")), "-"]
+                row += [Cell.of(result.mean("kf_flag", "hold")), "-"]
             else:
-                row += [_cell(result.mean(name, part)) for part in ("h", "hdot")]
+                row += [Cell.of(result.mean(name, part)) for part in ("h", "hdot")]
         rows.append(row)
     header = [
         "estimator",
@@ -107,7 +103,7 @@ def batch_table(results: Results) -> Table:
             for part, unit in (("h", 0), ("hdot", 1)):
                 ratios = batch_ratios(result, mode, part)
                 row.append(f"{PUBLISHED['nominal'][unit] / PUBLISHED['adaptive'][unit]:.1f}")
-                row += [Cell(ratios.min()), Cell(ratios.max()), _cell(jf.metrics.mean(ratios))]
+                row += [Cell(ratios.min()), Cell(ratios.max()), Cell.of(jf.metrics.mean(ratios))]
             rows.append(row)
     header = ["direction", "second moment"]
     header += [f"{part}, {what}" for part in ("h", "h'") for what in ("paper", "smallest", "largest", "mean")]
@@ -133,7 +129,7 @@ def limit_table(results: Results) -> Table:
     """MSE of h at the end, with the right probabilities and something else wrong."""
     names = ("nominal, exact", "adaptive 5, exact", "open", "kf_flag", "kf_ts")
     rows: list[list[Entry]] = [
-        [case, *(_cell(result.mean(name, "last")) for name in names)] for case, result in results.items()
+        [case, *(Cell.of(result.mean(name, "last")) for name in names)] for case, result in results.items()
     ]
     note = (
         f"MSE of h [m²] over the last {LAST} samples; true and assumed alpha {ALPHAS['printed'][0]}. The step is on "

@@ -73,8 +73,8 @@ def table(regime: Regime, result: jf.MonteCarloResult) -> Table:
     rows = []
     order = [name for name in [*regime.gap.strategies, CA_FILTER] if name in result.scores]
     for name in order:
-        cells = [_cell(result.root_mean(name, part)) for part in ("gap", "end", "after")]
-        rows.append([name, *cells, _cell(result.mean(name, "nees"))])
+        cells = [Cell.of(result.root_mean(name, part)) for part in ("gap", "end", "after")]
+        rows.append([name, *cells, Cell.of(result.mean(name, "nees"))])
     gap = regime.gap
     note = (
         f"Position RMSE [m] over samples {gap.first} to {gap.last}, at sample {gap.last}, and over the {gap.after} "
@@ -83,10 +83,6 @@ def table(regime: Regime, result: jf.MonteCarloResult) -> Table:
     )
     header = ["strategy", "gap", "end", "after", "NEES"]
     return Table(regime.name, regime.title, header, rows, note, result.runs)
-
-
-def _cell(estimate: jf.metrics.Estimate) -> Cell:
-    return Cell(float(estimate.value), float(estimate.standard_error))
 
 
 def big_batch(options: Options) -> tuple[Table, dict[str, object]]:
@@ -117,9 +113,9 @@ def wiener_table(options: Options) -> Table:
         jax.random.key(options.seed),
     )
     rows = [
-        ["measurement alone", "10.0", _cell(result.mean("KF", "raw"))],
-        ["Kalman filter", "4.09", _cell(result.mean("KF", "filtered"))],
-        ["RTS smoother", "1.03", _cell(result.mean("KF", "smoothed"))],
+        ["measurement alone", "10.0", Cell.of(result.mean("KF", "raw"))],
+        ["Kalman filter", "4.09", Cell.of(result.mean("KF", "filtered"))],
+        ["RTS smoother", "1.03", Cell.of(result.mean("KF", "smoothed"))],
     ]
     header = ["estimate", "theory, prior-drawn start", "ours"]
     note = "Position MSE per axis [m²] over 50 samples. Started at x0 = m0, so below the theory for a drawn start."
@@ -144,7 +140,7 @@ def claims(results: dict[str, jf.MonteCarloResult]) -> Table:
         (f"{never}, with a structurally wrong filter (G2, CV), in the gap", wrong, "fit N20 p2", "coast", "gap"),
     ]
     rows: list[list[Entry]] = [
-        [claim, "none", f"{a} / {b}", _cell(result.ratio((a, part), (b, part), root=True))]
+        [claim, "none", f"{a} / {b}", Cell.of(result.ratio((a, part), (b, part), root=True))]
         for claim, result, a, b, part in claimed
     ]
     header = ["the thesis", "its number", "ratio of RMSEs", "ours"]

@@ -164,10 +164,6 @@ def sine_gap(options: Options) -> tuple[list[Table], list[Path], list[str]]:
     return tables, paths, quick_findings(results) if options.quick else findings(results)
 
 
-def _cell(estimate: jf.metrics.Estimate) -> Cell:
-    return Cell(float(estimate.value), float(estimate.standard_error))
-
-
 def share(result: jf.MonteCarloResult, name: str) -> Cell:
     """Percentage of runs that lost lock, with its binomial standard error.
 
@@ -185,8 +181,8 @@ def table(r: float, result: jf.MonteCarloResult, free: jf.MonteCarloResult) -> T
     found |= {name: (result, name) for name in order}
     rows: list[list[Entry]] = []
     for label, (source, name) in found.items():
-        cells = [_cell(source.root_mean(name, part)) for part in ("gap", "after", "end")]
-        nees = _cell(source.mean(name, "nees"))
+        cells = [Cell.of(source.root_mean(name, part)) for part in ("gap", "after", "end")]
+        nees = Cell.of(source.mean(name, "nees"))
         rows.append([label, PROTOTYPE[r].get(label, "-"), *cells, share(source, name), nees])
     header = ["strategy", "prototype", "gap", "first 20 after", "last 20", "lost [%]", "NEES"]
     note = (
@@ -199,7 +195,7 @@ def table(r: float, result: jf.MonteCarloResult, free: jf.MonteCarloResult) -> T
 
 
 def _ratio(result, a, b, part="gap"):
-    return _cell(result.ratio((a, part), (b, part), root=True))
+    return Cell.of(result.ratio((a, part), (b, part), root=True))
 
 
 def quick_findings(results: dict[float, jf.MonteCarloResult]) -> list[str]:
@@ -229,7 +225,7 @@ def findings(results: dict[float, jf.MonteCarloResult]) -> list[str]:
         f"({_ratio(quiet, 'EKF2 coast', coast, 'after')} and {_ratio(quiet, 'UKF coast', coast, 'after')} of it).",
         f"G3, the sinusoid's low rate of lost lock does not last: at R = {high:g} it is {lost(noisy, fit)} against "
         f"{lost(noisy, coast)} for coasting, EKF2 {lost(noisy, 'EKF2 coast')}, UKF {lost(noisy, 'UKF coast')}. Its "
-        f"NEES at the gap's end is {_cell(quiet.mean(fit, 'nees'))} (R = {low:g}): a smaller covariance damps the "
+        f"NEES at the gap's end is {Cell.of(quiet.mean(fit, 'nees'))} (R = {low:g}): a smaller covariance damps the "
         "EKF's linearized correction. Coasting without process noise in the gap is overconfident too and loses "
         f"{lost(quiet, 'EKF coast, Q = 0 in the gap')}; more noise (x10) makes it worse, "
         f"{lost(quiet, 'EKF coast_inflated x10')}.",

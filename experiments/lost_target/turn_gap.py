@@ -177,10 +177,6 @@ def turn_gap(options: Options) -> tuple[list[Table], list[Path], list[str]]:
     return tables, [figures.turn(path(), GAPS, results, courses, where)], sentences
 
 
-def _cell(estimate: jf.metrics.Estimate) -> Cell:
-    return Cell(float(estimate.value), float(estimate.standard_error))
-
-
 def _label(gap: str) -> str:
     return f"{gap}, {GAPS[gap][0]} to {GAPS[gap][1]}"
 
@@ -192,7 +188,7 @@ def table(results: dict[Key, jf.MonteCarloResult], r: float, part: str) -> Table
     prototype = PROTOTYPE[r] if part == "gap" else PROTOTYPE_AFTER if r == NOISE[0] else {}
     rows: list[list[Entry]] = []
     for gap, result in shown.items():
-        rows.append([_label(gap), "ours", *(_cell(result.root_mean(name, part)) for name in names)])
+        rows.append([_label(gap), "ours", *(Cell.of(result.root_mean(name, part)) for name in names)])
         if gap in prototype:
             published = dict(zip(COLUMNS, prototype[gap], strict=True))
             rows.append([_label(gap), "prototype", *(published[name] for name in names)])
@@ -210,7 +206,7 @@ def own_table(results: dict[Key, jf.MonteCarloResult]) -> Table:
     some = next(iter(results.values()))
     names = [name for name in some.scores if name.endswith("own")]
     rows: list[list[Entry]] = [
-        [f"{r:g}", _label(gap), *(_cell(result.root_mean(name, "gap")) for name in names)]
+        [f"{r:g}", _label(gap), *(Cell.of(result.root_mean(name, "gap")) for name in names)]
         for (r, gap), result in results.items()
     ]
     note = "RMSE of the position in the plane over the gap, with standard errors. The prototype has no such figures."
@@ -224,7 +220,7 @@ def nees_table(results: dict[Key, jf.MonteCarloResult]) -> Table:
     wanted = (*COASTS, "fit N10 p1, zero", "fit N5 p1, zero", "fit_weighted N5 p1, zero", "fit N5 p1, own")
     names = [name for name in wanted if name in some.scores]
     rows: list[list[Entry]] = [
-        [f"{r:g}", _label(gap), *(_cell(result.mean(name, "nees")) for name in names)]
+        [f"{r:g}", _label(gap), *(Cell.of(result.mean(name, "nees")) for name in names)]
         for (r, gap), result in results.items()
     ]
     note = "NEES/2 of the position at the gap's last sample: 1 is honest, more is overconfident."
@@ -250,7 +246,7 @@ def best_fit(result: jf.MonteCarloResult, mixings: tuple[str, ...] = tuple(MIXIN
 
 def ratio(result: jf.MonteCarloResult, a: str, b: str, part: str = "gap") -> Cell:
     """Of two RMSEs."""
-    return _cell(result.ratio((a, part), (b, part), root=True))
+    return Cell.of(result.ratio((a, part), (b, part), root=True))
 
 
 def deviations(results: dict[Key, jf.MonteCarloResult]) -> list[float]:
@@ -295,7 +291,7 @@ def findings(results: dict[Key, jf.MonteCarloResult]) -> list[str]:
         for gap, result in group.items():
             value, se = best(result)
             side = "tie" if abs(value - 1) <= 2 * se else "coast" if value > 1 else "fit"
-            sides[side].append(f"{short(gap)} {_cell(best(result))}")
+            sides[side].append(f"{short(gap)} {Cell.of(best(result))}")
         shown = {side: ", ".join(cells) or "no gap" for side, cells in sides.items()}
         return f"coasting is ahead in {shown['coast']}; the fit in {shown['fit']}; neither clearly in {shown['tie']}"
 
@@ -336,8 +332,8 @@ def findings(results: dict[Key, jf.MonteCarloResult]) -> list[str]:
         f"G4, “a shorter window in a maneuver”: RMSE with N10 → N5 at R = {low:g} and at R = {high:g}: "
         f"{'; '.join(windows(gap) for gap in ('C onset + 5', 'D turn', 'E turn', 'F exit', 'A straight'))}. "
         "It trades noise for bias and is no rule. A gap that begins with the turn has no sample that tells of it: the "
-        f"best fit over the better coast is {_cell(best(quiet['B onset']))} in B and "
-        f"{_cell(best(quiet['G onset 2']))} in G (R = {low:g}).",
+        f"best fit over the better coast is {Cell.of(best(quiet['B onset']))} in B and "
+        f"{Cell.of(best(quiet['G onset 2']))} in G (R = {low:g}).",
         f"G4, biased mixing costs more than the gap: coasting at R = {high:g} in mid-turn, `own` / `zero` is "
         f"{ratio(D, own, zero)} (D) and {ratio(E, own, zero)} (E). The fit N10 p1 is ahead of `zero` coasting there "
         f"({ratio(D, N10, zero)}, {ratio(E, N10, zero)}), not of `own` coasting, not even around the `own` IMM itself "

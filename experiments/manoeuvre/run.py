@@ -139,7 +139,7 @@ def detection_table(results: dict[float, jf.MonteCarloResult]) -> Table:
     """Measured false alarms and delays."""
     first = results[ACCELERATIONS[0]]
     rows: list[list[Entry]] = [
-        [name, _cell(first.mean(name, "false")), *(_cell(results[a].mean(name, "delay")) for a in ACCELERATIONS)]
+        [name, Cell.of(first.mean(name, "false")), *(Cell.of(results[a].mean(name, "delay")) for a in ACCELERATIONS)]
         for name in DETECTORS
     ]
     header = ["statistic", "false alarms", *(f"delay at {a} m/s²" for a in ACCELERATIONS)]
@@ -156,14 +156,10 @@ def answer_table(results: dict[float, jf.MonteCarloResult]) -> Table:
     for name in answers():
         peak = np.sqrt(results[PUSH[1]].scores[name]["course"].mean(axis=0)[ONSET:].max())
         cells = [first.root_mean(name, "quiet"), *(results[a].root_mean(name, "maneuver") for a in PUSH)]
-        rows.append([name, *map(_cell, cells), Cell(peak)])
+        rows.append([name, *map(Cell.of, cells), Cell(peak)])
     header = ["filter", "quiet", *(f"{a:g} m/s²" for a in PUSH), f"peak at {PUSH[1]:g} m/s²"]
     note = f"Position RMSE [m] over samples 20 to {ONSET - 1}, and over the {LENGTH} samples of the maneuver."
     return Table("answers", "Adaptive answers to a maneuver", header, rows, note, first.runs)
-
-
-def _cell(estimate: jf.metrics.Estimate) -> Cell:
-    return Cell(float(estimate.value), float(estimate.standard_error))
 
 
 def findings(results: dict[float, jf.MonteCarloResult]) -> list[str]:

@@ -95,7 +95,7 @@ def table(result: jf.MonteCarloResult) -> Table:
         published = MANUAL.get(name.split(",")[0])
         shown = "-" if published is None or name.endswith("own") else f"{published:.4f}"
         cells = [result.mean(name, part) for part in ("filtered", "smoothed")]
-        rows.append([name, shown, *(Cell(float(c.value), float(c.standard_error)) for c in cells)])
+        rows.append([name, shown, *map(Cell.of, cells)])
     header = ["filter", "manual", "ours", "ours, smoothed"]
     note = "MSE per coordinate [length²]. The published values are of one batch of 100 runs, which scatters by 0.0004."
     return Table("turn", "Coordinated turn without a gap", header, rows, note, result.runs)
