@@ -1,0 +1,1 @@
+"""A balloon by the fuzzy mixed Kalman/H-infinity filter: what its adaptation does, and what would help."""
