@@ -35,6 +35,7 @@ from jaxfilt.filters import hinf as hinf
 from jaxfilt.filters import imm as imm
 from jaxfilt.filters import kalman as kalman
 from jaxfilt.filters import mixed_hinf as mixed_hinf
+from jaxfilt.filters import particle as particle
 from jaxfilt.filters import riccati as riccati
 from jaxfilt.filters import sqrt_cubature as sqrt_cubature
 from jaxfilt.filters import sqrt_extended as sqrt_extended

@@ -5,11 +5,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from tests.examples import Example, T, adaptive, delayed, hinf, imm, linear, noise, nonlinear
+from tests.examples import Example, T, adaptive, delayed, hinf, imm, linear, noise, nonlinear, particle
 
 REGISTRY: dict[str, Example] = {
     **adaptive.EXAMPLES, **delayed.EXAMPLES, **hinf.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES,
-    **noise.EXAMPLES,
+    **noise.EXAMPLES, **particle.EXAMPLES,
 }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from jaxfilt.filters.hinf import sqrt_mixed_hinf as sqrt_mixed_hinf
 from jaxfilt.filters.hinf import theta_max as theta_max
 from jaxfilt.filters.imm import imm as imm
 from jaxfilt.filters.kalman import kalman as kalman
+from jaxfilt.filters.particle import particle as particle
 from jaxfilt.filters.sqrt_kalman import sqrt_kalman as sqrt_kalman
 from jaxfilt.filters.unscented import cubature as cubature
 from jaxfilt.filters.unscented import sqrt_cubature as sqrt_cubature

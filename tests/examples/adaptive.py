@@ -86,13 +86,13 @@ def _example(factory, make, **parameters):
 
 EXAMPLES: dict[str, Example] = {
     "detected": _example(jf.detected, _detected),
-    "detected_sum": _example(jf.detected, _detected_sum),
+    "detected_sum": _example(jf.detected, _detected_sum)._replace(twin=True),
     "q_inflated": _example(jf.q_inflated, _q_inflated, factor=np.array(20.0)),
-    "p_inflated": _example(jf.p_inflated, _p_inflated, factor=np.array(3.0)),
+    "p_inflated": _example(jf.p_inflated, _p_inflated, factor=np.array(3.0))._replace(twin=True),
     "gain_floor": _example(jf.gain_floor, _gain_floor, alpha=np.array(0.9), beta=np.array(0.6)),
     "variable_dimension": _example(
         jf.variable_dimension, _variable_dimension, ca={"q": np.array(0.05), "r": np.array([0.6, 0.7])}
     ),
-    "gated": _example(jf.gated, _gated, p_false=np.array(0.3)),
+    "gated": _example(jf.gated, _gated, p_false=np.array(0.3))._replace(twin=True),
     "nearest_neighbor": _example(jf.nearest_neighbor, _nearest_neighbor, p_false=np.array(0.2)),
 }

@@ -72,7 +72,7 @@ EXAMPLES: dict[str, Example] = {
     "kalman": Example(jf.kalman, _kalman, LINEAR),
     "sqrt_kalman": Example(jf.sqrt_kalman, _sqrt_kalman, LINEAR),
     "alpha_beta": Example(jf.alpha_beta, _alpha_beta, _AB),
-    "alpha_beta_gamma": Example(jf.alpha_beta_gamma, _alpha_beta_gamma, _ABG),
+    "alpha_beta_gamma": Example(jf.alpha_beta_gamma, _alpha_beta_gamma, _ABG, twin=True),
     "coast_inflated": _wrapped(jf.coast_inflated, _coast_inflated, factor=3.0),
     "hold_last": _wrapped(jf.hold_last, _hold_last)._replace(twin=True),
     "mean_of_recent": _wrapped(jf.mean_of_recent, _mean_of_recent)._replace(twin=True),

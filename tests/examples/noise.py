@@ -84,7 +84,7 @@ EXAMPLES: dict[str, Example] = {
     "fuzzy_stationary": _example(jf.fuzzy_noise, _fuzzy_stationary, True, **_SMOOTH, theta=0.2),
     "sage_husa": _example(jf.sage_husa, _sage_husa, forgetting=0.8, prior=2.0),
     "sage_husa_q": _example(jf.sage_husa, _sage_husa_q, True, forgetting=0.8, prior=2.0),
-    "covariance_matching": _example(jf.covariance_matching, _covariance_matching),
+    "covariance_matching": _example(jf.covariance_matching, _covariance_matching, True),
     "covariance_matching_q": _example(jf.covariance_matching, _covariance_matching_q, True),
     "fading_memory": _example(jf.fading_memory, _fading_memory, True, factor=1.1),
 }  # fmt: skip

@@ -23,6 +23,8 @@ from experiments.balloon import run as balloon
 from experiments.balloon.settings import KALMAN, A, B, C, compute, fuzzy_name, mixed_name, theta_max
 from experiments.report import Options, Report, compare
 
+pytestmark = pytest.mark.xdist_group("balloon")  # one process, so that its tests share what they compute
+
 SHARES = (0.9, 0.99, 0.995)
 CLASSICAL, FUZZY = mixed_name(0.995), fuzzy_name("innovation")
 seeds = pytest.mark.parametrize("seed", [1, 2, 3])
@@ -53,6 +55,7 @@ def check_b(scores):
     assert 1.9 <= over(scores, CLASSICAL, FUZZY, "corrected") <= 2.3
 
 
+@pytest.mark.slow
 def test_setting_a_and_b_small():
     check_a(result(A, 2.0, 60, 1))
     check_b(result(B, 1.0, 60, 1))

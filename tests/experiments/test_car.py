@@ -11,6 +11,8 @@ from experiments.car import drive as recorded
 from experiments.car import filters, run
 from experiments.report import Options, Report, compare
 
+pytestmark = pytest.mark.xdist_group("car")  # one process, so that its tests share what they compute
+
 CHOSEN = ("CV", "car, wheels", "car, wheels and gyro")  # the quick form's, so that the same programs serve
 
 

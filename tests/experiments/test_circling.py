@@ -18,6 +18,8 @@ from experiments.planar import MODES, Data, in_wind, loss, read_parameters, spac
 from experiments.report import Options, Report, compare
 from jaxfilt import tune
 
+pytestmark = pytest.mark.xdist_group("circling")  # one process, so that its tests share what they compute
+
 PUBLISHED = json.loads((ROOT / "circling" / "published.json").read_text(encoding="utf-8"))
 PARAMS = read_parameters(PUBLISHED["tables"]["circling_tuning"])
 NAMES = ("CV", "IMM (CV, CT)")  # few to compile

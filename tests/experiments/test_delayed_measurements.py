@@ -17,6 +17,8 @@ from experiments.delayed_measurements import run as experiment
 from experiments.report import Options, Report, compare
 from jaxfilt.models.linear import value
 
+pytestmark = pytest.mark.xdist_group("delayed_measurements")  # one process, so that its tests share what they compute
+
 RUNS = 1000
 seeds = pytest.mark.parametrize(
     "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]

@@ -14,8 +14,12 @@ from experiments.__main__ import ROOT
 from experiments.lost_target.run import CA_FILTER
 from experiments.report import Options, Report, compare
 
+pytestmark = pytest.mark.xdist_group("lost_target")  # one process, so that its tests share what they compute
+
 RUNS = 1000
-seeds = pytest.mark.parametrize("seed", [0, 1, 2])
+seeds = pytest.mark.parametrize(
+    "seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)]
+)
 
 
 @functools.cache

@@ -13,6 +13,8 @@ from experiments.radar import scans as recorded
 from experiments.radar import scores as scoring
 from experiments.report import Options, Report, compare
 
+pytestmark = pytest.mark.xdist_group("radar")  # one process, so that its tests share what they compute
+
 
 @pytest.fixture(scope="module")
 def each():

@@ -15,6 +15,8 @@ from experiments.__main__ import ROOT
 from experiments.lost_target import sine_gap
 from experiments.report import Report, compare
 
+pytestmark = pytest.mark.xdist_group("sine_gap")  # one process, so that its tests share what they compute
+
 SMALL = ("EKF coast", "UKF coast")  # one compiled program for all default tests
 COAST, HOLD, MEAN = "EKF coast", "EKF hold", "EKF mean 5"
 FIT, POLYNOMIAL = "EKF fit sinusoid N50", "EKF fit N20 p2"

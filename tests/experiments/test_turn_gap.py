@@ -16,6 +16,8 @@ from experiments.lost_target import turn_gap
 from experiments.lost_target.turn_gap import COASTS, GAPS, LETTERED, NOISE, path, simulate
 from experiments.report import Report, compare
 
+pytestmark = pytest.mark.xdist_group("turn_gap")  # one process, so that its tests share what they compute
+
 ZERO, OWN = COASTS
 N10, N5 = "fit N10 p1, zero", "fit N5 p1, zero"
 FITS = tuple(f"{name}, {mixing}" for mixing, names in turn_gap.MIXINGS.items() for name in names if "fit" in name)

@@ -15,6 +15,8 @@ from experiments.vessels import run as vessels
 from experiments.vessels import tracks
 from jaxfilt import tune
 
+pytestmark = pytest.mark.xdist_group("vessels")  # one process, so that its tests share what they compute
+
 PUBLISHED = json.loads((ROOT / "vessels" / "published.json").read_text(encoding="utf-8"))
 PARAMS = read_parameters(PUBLISHED["tables"]["vessels_tuning"])
 NAMES = ("CV", "IMM (CV, CT)")  # few to compile
