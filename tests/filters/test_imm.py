@@ -158,8 +158,9 @@ def test_a_mode_that_is_never_left_is_its_filter(j, dtype):
     params = [params[i] if i == j else loud[i] for i in range(2)]
     out = jf.filter(build(params, np.eye(2), mu0=np.eye(2)[j], dtype=dtype), ys)
     one = jf.filter(single(params[j], dtype), ys)
-    np.testing.assert_allclose(out.mean, one.mean, rtol=1e-6 if dtype == jnp.float32 else 1e-10)
-    np.testing.assert_allclose(out.log_lik, one.log_lik, rtol=1e-6 if dtype == jnp.float32 else 1e-10)
+    tol = 1e-6 if dtype == jnp.float32 else 1e-10
+    for got, want in ((out.mean, one.mean), (out.log_lik, one.log_lik)):
+        np.testing.assert_allclose(got, want, rtol=0, atol=tol * np.abs(want).max())
     assert (np.asarray(out.extra["mode_probabilities"]) == np.eye(2)[j]).all()
 
 
@@ -243,7 +244,8 @@ def test_underflowing_likelihoods(dtype):
     assert np.isfinite(gradient).all()
     mu = np.asarray(out.extra["mode_probabilities"])
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((out.mean, out.cov, out.log_lik, mu)))
-    np.testing.assert_allclose(mu.sum(axis=1), 1, rtol=1e-6)
+    # Probabilities are kept as logarithms: what they sum to is off by eps times nats, of which there are many here.
+    np.testing.assert_allclose(mu.sum(axis=1), 1, rtol=5e-6 if dtype == jnp.float32 else 1e-6)
     assert mu[3, 0] == 0
     np.testing.assert_allclose(mu[9], mu[8] @ PI, rtol=1e-5)
     bad = (np.asarray(out.status) & int(jf.Status.NONFINITE)) != 0
