@@ -1,6 +1,7 @@
 """jaxfilt: recursive state estimators for JAX."""
 
 from jaxfilt import fuzzy as fuzzy
+from jaxfilt import initial as initial
 from jaxfilt import linalg as linalg
 from jaxfilt import maneuver as maneuver
 from jaxfilt import metrics as metrics
@@ -27,15 +28,26 @@ from jaxfilt.core import wrap as wrap
 from jaxfilt.filters import adaptive_delayed_kalman as adaptive_delayed_kalman
 from jaxfilt.filters import alpha_beta as alpha_beta
 from jaxfilt.filters import alpha_beta_gamma as alpha_beta_gamma
+from jaxfilt.filters import attitude as attitude
+from jaxfilt.filters import attitude_peak as attitude_peak
+from jaxfilt.filters import attitude_switched as attitude_switched
+from jaxfilt.filters import attitude_velocity as attitude_velocity
+from jaxfilt.filters import bank as bank
+from jaxfilt.filters import complementary as complementary
 from jaxfilt.filters import cubature as cubature
 from jaxfilt.filters import delayed_kalman as delayed_kalman
 from jaxfilt.filters import extended as extended
 from jaxfilt.filters import gains as gains
 from jaxfilt.filters import hinf as hinf
 from jaxfilt.filters import imm as imm
+from jaxfilt.filters import joint_particle as joint_particle
 from jaxfilt.filters import kalman as kalman
+from jaxfilt.filters import madgwick as madgwick
+from jaxfilt.filters import mahony as mahony
 from jaxfilt.filters import mixed_hinf as mixed_hinf
+from jaxfilt.filters import multi_mode_particle as multi_mode_particle
 from jaxfilt.filters import particle as particle
+from jaxfilt.filters import rao_blackwellized as rao_blackwellized
 from jaxfilt.filters import riccati as riccati
 from jaxfilt.filters import sqrt_cubature as sqrt_cubature
 from jaxfilt.filters import sqrt_extended as sqrt_extended
@@ -45,6 +57,7 @@ from jaxfilt.filters import sqrt_unscented as sqrt_unscented
 from jaxfilt.filters import theta_max as theta_max
 from jaxfilt.filters import unscented as unscented
 from jaxfilt.models.delays import lag_inputs as lag_inputs
+from jaxfilt.models.imu import imu_inputs as imu_inputs
 from jaxfilt.montecarlo import Draw as Draw
 from jaxfilt.montecarlo import MonteCarloResult as MonteCarloResult
 from jaxfilt.montecarlo import Scenario as Scenario
@@ -53,6 +66,8 @@ from jaxfilt.montecarlo import scenario as scenario
 from jaxfilt.smooth import Smoothed as Smoothed
 from jaxfilt.smooth import rts as rts
 from jaxfilt.smooth import smooth as smooth
+from jaxfilt.smooth_particles import SmoothedParticles as SmoothedParticles
+from jaxfilt.smooth_particles import smooth_particles as smooth_particles
 from jaxfilt.wrappers import FuzzyNoise as FuzzyNoise
 from jaxfilt.wrappers import blend as blend
 from jaxfilt.wrappers import coast_inflated as coast_inflated
@@ -68,10 +83,13 @@ from jaxfilt.wrappers import gated as gated
 from jaxfilt.wrappers import hold_last as hold_last
 from jaxfilt.wrappers import mean_of_recent as mean_of_recent
 from jaxfilt.wrappers import nearest_neighbor as nearest_neighbor
+from jaxfilt.wrappers import nis_q as nis_q
 from jaxfilt.wrappers import p_inflated as p_inflated
 from jaxfilt.wrappers import polynomial_fit as polynomial_fit
 from jaxfilt.wrappers import q_inflated as q_inflated
+from jaxfilt.wrappers import residual_r as residual_r
 from jaxfilt.wrappers import sage_husa as sage_husa
 from jaxfilt.wrappers import scan_inputs as scan_inputs
 from jaxfilt.wrappers import sinusoid_fit as sinusoid_fit
+from jaxfilt.wrappers import usable_where as usable_where
 from jaxfilt.wrappers import variable_dimension as variable_dimension

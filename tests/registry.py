@@ -5,11 +5,27 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from tests.examples import Example, T, adaptive, delayed, hinf, imm, linear, noise, nonlinear, particle
+from tests.examples import (
+    Example,
+    T,
+    adaptive,
+    attitude,
+    bearing,
+    delayed,
+    hinf,
+    imm,
+    joint,
+    linear,
+    noise,
+    nonlinear,
+    particle,
+    rao_blackwellized,
+)
 
 REGISTRY: dict[str, Example] = {
-    **adaptive.EXAMPLES, **delayed.EXAMPLES, **hinf.EXAMPLES, **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES,
-    **noise.EXAMPLES, **particle.EXAMPLES,
+    **adaptive.EXAMPLES, **attitude.EXAMPLES, **bearing.EXAMPLES, **delayed.EXAMPLES, **hinf.EXAMPLES,
+    **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES, **joint.EXAMPLES, **noise.EXAMPLES, **particle.EXAMPLES,
+    **rao_blackwellized.EXAMPLES,
 }  # fmt: skip
 
 

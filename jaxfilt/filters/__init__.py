@@ -2,6 +2,14 @@
 
 from jaxfilt.filters.alpha_beta import alpha_beta as alpha_beta
 from jaxfilt.filters.alpha_beta import alpha_beta_gamma as alpha_beta_gamma
+from jaxfilt.filters.attitude import attitude as attitude
+from jaxfilt.filters.attitude import attitude_peak as attitude_peak
+from jaxfilt.filters.attitude import attitude_switched as attitude_switched
+from jaxfilt.filters.attitude import attitude_velocity as attitude_velocity
+from jaxfilt.filters.bank import bank as bank
+from jaxfilt.filters.complementary import complementary as complementary
+from jaxfilt.filters.complementary import madgwick as madgwick
+from jaxfilt.filters.complementary import mahony as mahony
 from jaxfilt.filters.delayed import adaptive_delayed_kalman as adaptive_delayed_kalman
 from jaxfilt.filters.delayed import delayed_kalman as delayed_kalman
 from jaxfilt.filters.extended import extended as extended
@@ -12,8 +20,11 @@ from jaxfilt.filters.hinf import riccati as riccati
 from jaxfilt.filters.hinf import sqrt_mixed_hinf as sqrt_mixed_hinf
 from jaxfilt.filters.hinf import theta_max as theta_max
 from jaxfilt.filters.imm import imm as imm
+from jaxfilt.filters.joint_particle import joint_particle as joint_particle
+from jaxfilt.filters.joint_particle import multi_mode_particle as multi_mode_particle
 from jaxfilt.filters.kalman import kalman as kalman
 from jaxfilt.filters.particle import particle as particle
+from jaxfilt.filters.rao_blackwellized import rao_blackwellized as rao_blackwellized
 from jaxfilt.filters.sqrt_kalman import sqrt_kalman as sqrt_kalman
 from jaxfilt.filters.unscented import cubature as cubature
 from jaxfilt.filters.unscented import sqrt_cubature as sqrt_cubature

@@ -35,9 +35,12 @@ class _Params(NamedTuple):
     model: Nonlinear
     order: Static
     iterations: Static
+    relinearize: Static
 
 
-def extended(model: Nonlinear | LinearGaussian, *, order: int = 1, iterations: int = 1) -> Filter:
+def extended(
+    model: Nonlinear | LinearGaussian, *, order: int = 1, iterations: int = 1, relinearize: bool = False
+) -> Filter:
     """The extended Kalman filter, in covariance form with the Joseph update.
 
     Predict: ``m- = f(m)``, ``P- = F P F' + Q`` with F the Jacobian of f at m. Update: as :func:`jaxfilt.kalman` with H
@@ -51,25 +54,29 @@ def extended(model: Nonlinear | LinearGaussian, *, order: int = 1, iterations: i
     density). The covariance is that of the last linearization, applied once, so no measurement counts twice;
     innovation, NIS and likelihood are those of the prediction.
 
+    ``relinearize`` computes the posterior covariance with H at the updated mean, which itself stays as it is: the
+    "modified-covariance" filter.
+
     Status: MISSED, NONFINITE, SINGULAR as in :func:`jaxfilt.kalman`.
 
     Args:
         model: from :func:`jaxfilt.models.nonlinear` or a builder; a linear-Gaussian model without S is accepted.
         order: 1 or 2. Second derivatives are automatic.
         iterations: linearizations of h per update, >= 1; more than one with order 1 only.
+        relinearize: one more linearization, for the covariance; with order 1 only.
 
     Raises:
-        ValueError: another order, iterations < 1, or both order 2 and iterations > 1.
+        ValueError: another order, iterations < 1, or order 2 with iterations > 1 or relinearize.
 
     Source: Jazwinski 1970; Bar-Shalom, Li and Kirubarajan 2001, section 10.3; thesis, eqs. (2-81) to (2-89); iterated:
-    Bell and Cathey 1993.
+    Bell and Cathey 1993; relinearized: Hashemi and Alfi 2019, eqs. (10) and (11).
     """
-    return bind(_params(model, order, iterations), _init, _predict, _update, _moments, _with_moments)
+    return bind(_params(model, order, iterations, relinearize), _init, _predict, _update, _moments, _with_moments)
 
 
 def sqrt_extended(model: Nonlinear | LinearGaussian, *, order: int = 1, iterations: int = 1) -> Filter:
     """The extended Kalman filter in array form: PSD by construction. Otherwise as :func:`extended`."""
-    p = _params(model, order, iterations)
+    p = _params(model, order, iterations, False)
     return bind(p, _sqrt_init, _sqrt_predict, _sqrt_update, _sqrt_moments, _sqrt_with_moments)
 
 
@@ -90,15 +97,17 @@ def init_mean(model: Nonlinear, inp: StepInput) -> Array:
     return model.m0
 
 
-def _params(model, order, iterations):
+def _params(model, order, iterations, relinearize):
     if order not in (1, 2):
         raise ValueError(f"order: expected 1 or 2, got {order!r}")
     if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
         raise ValueError(f"iterations: expected an int >= 1, got {iterations!r}")
     if order == 2 and iterations > 1:
         raise ValueError(f"iterations: expected 1 with order=2, got {iterations}")
+    if order == 2 and relinearize:
+        raise ValueError("relinearize: expected False with order=2")
     model = as_nonlinear(model) if isinstance(model, LinearGaussian) else model
-    return _Params(model, Static(order), Static(iterations))
+    return _Params(model, Static(order), Static(iterations), Static(bool(relinearize)))
 
 
 def _linearize(fn, given, mean, P, inp, order, noise):
@@ -171,6 +180,10 @@ def _update(p, state, inp):
         return joseph_update(inp, mean, P, predicted, H, R, residual)
 
     info, cov = _iterate(p, inp, mean, predicted, H, update)
+    if p.relinearize.value:
+        H = jacobian(p.model.h, p.model.h_jacobian, info.mean, inp.u, inp.dt)
+        _, cov = update(inp, predicted, H, p.model.residual)
+        info = info._replace(cov=cov)
     return ExtendedState(info.mean, cov), info
 
 

@@ -8,3 +8,5 @@ from jaxfilt.linalg.dense import solve_lower as solve_lower
 from jaxfilt.linalg.dense import solve_lower_t as solve_lower_t
 from jaxfilt.linalg.dense import sym as sym
 from jaxfilt.linalg.dense import tria as tria
+from jaxfilt.linalg.rotations import rotation as rotation
+from jaxfilt.linalg.rotations import skew as skew

@@ -5,6 +5,7 @@ from jaxfilt.models.delays import delay_probabilities as delay_probabilities
 from jaxfilt.models.delays import success_probabilities as success_probabilities
 from jaxfilt.models.delays import with_lags as with_lags
 from jaxfilt.models.discretise import van_loan as van_loan
+from jaxfilt.models.imu import imu_inputs as imu_inputs
 from jaxfilt.models.linear import LinearGaussian as LinearGaussian
 from jaxfilt.models.linear import linear_gaussian as linear_gaussian
 from jaxfilt.models.motion import constant_acceleration as constant_acceleration

@@ -2,9 +2,9 @@
 
 Give one to a motion model with :func:`jaxfilt.models.with_sensor`. R is an array (checked) or a function
 ``(x, u, dt)``. The observer is at the origin, or where ``observer`` says: an array or a function ``(u, dt)`` of what is
-in force, either ``[x, y]`` or ``[x, y, vx, vy]``. Bearings are counter-clockwise from the x axis [rad]; their residuals
-are wrapped to [-pi, pi], and by the same residual sigma points are averaged, so the line where bearings jump is nowhere
-special.
+in force, either ``[x, y]`` or ``[x, y, vx, vy]``. Bearings are counter-clockwise from the x axis [rad], unless a sensor
+offers the compass's; their residuals are wrapped to [-pi, pi], and by the same residual sigma points are averaged, so
+the line where bearings jump is nowhere special.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.core import Static, aspartial
-from jaxfilt.models.linear import check_covariance, common_dtype
+from jaxfilt.core import Static, aspartial, is_concrete
+from jaxfilt.models.linear import check_covariance, check_positive, common_dtype
 from jaxfilt.models.nonlinear import Sensor
 
 
@@ -46,6 +47,55 @@ def range_rate(R: Any, *, observer: Any = None) -> Sensor:
     The rate is relative to the observer's velocity if ``observer`` gives one, else the observer is at rest.
     """
     return Sensor(Partial(_range_rate, _observer(observer)), _covariance(R, 3), Partial(wrap_at, Static((1,))))
+
+
+def bearing_doppler(
+    R: Any, *, speed: Any = 1500.0, observer: Any = None, doppler: str = "first", compass: bool = False
+) -> Sensor:
+    """Measures ``[bearing, received frequency]`` of a target that emits a tone; R (2, 2) [rad^2, Hz^2].
+
+    The state is ``[x, y, vx, vy, f_B]`` with the emitted frequency f_B [Hz]. With ``u`` the unit vector from observer
+    to target and ``V_D`` the rate of the range [m/s]::
+
+        first:  f_r = f_B (1 - V_D / speed)
+        exact:  f_r = f_B (speed + u v_observer) / (speed + u v_target)
+
+    They differ by about ``f_B (u v_target) V_D / speed^2``.
+
+    Where the target is at the observer the derivatives of the bearing are 0. Closer than some distance no linearization
+    of it is good: :func:`jaxfilt.usable_where` with :func:`apart` leaves such samples out.
+
+    Args:
+        R: array, positive definite, or function.
+        speed: of propagation [m/s], > 0; the default is that of sound in sea water. May be traced.
+        observer: as in this module's head.
+        doppler: ``"first"`` order in V_D / speed, or ``"exact"`` for a medium at rest.
+        compass: bearings clockwise from the y axis (north), ``atan2(dx, dy)``, instead.
+
+    Raises:
+        ValueError: speed <= 0, a (concrete) R that is not positive definite, another doppler.
+    """
+    check_positive("speed", speed)
+    if doppler not in ("first", "exact"):
+        raise ValueError(f'doppler: expected "first" or "exact", got {doppler!r}')
+    noise = _covariance(R, 2)
+    if not callable(R) and is_concrete(R):
+        A = np.asarray(R, np.float64)
+        if not (A[0, 0] > 0 and A[0, 0] * A[1, 1] > A[0, 1] * A[1, 0]):
+            raise ValueError(f"R: expected a positive definite matrix, got {A.tolist()}")
+    h = Partial(_bearing_doppler, _observer(observer), speed, Static((doppler, compass)))
+    return Sensor(h, noise, Partial(wrap_at, Static((0,))))
+
+
+def apart(distance: Any, observer: Any, mean: Array, y: Array, u: Any, dt: Array | None) -> Array:
+    """Whether the bearing is usable: the target is expected ``distance`` [m] or more from the observer.
+
+    For :func:`jaxfilt.usable_where`, as ``Partial(apart, distance, observer)``: the first component (the bearing) is
+    judged, the others are usable.
+    """
+    dx, dy = _relative(_observer(observer), mean, u, dt, 2)
+    far = dx * dx + dy * dy >= jnp.asarray(distance, mean.dtype) ** 2
+    return jnp.ones(y.shape, bool).at[0].set(far)
 
 
 def wrap(angle: Array) -> Array:
@@ -118,3 +168,19 @@ def _range_rate(observer, x, u, dt):
     distance, angle = _polar(dx, dy)
     rate = (dx * dvx + dy * dvy) / jnp.where(distance > 0, distance, 1.0)
     return jnp.stack([distance, angle, rate])
+
+
+def _bearing_doppler(observer, speed, options, x, u, dt):
+    doppler, compass = options.value
+    if x.shape[0] < 5:
+        raise ValueError(f"x: the sensor needs a state [x, y, vx, vy, f_B], got {x.shape[0]} components")
+    dx, dy, dvx, dvy = _relative(observer, x, u, dt, 4)
+    distance, _ = _polar(dx, dy)
+    angle = _polar(dy, dx)[1] if compass else _polar(dx, dy)[1]
+    safe = jnp.where(distance > 0, distance, 1.0)
+    speed = jnp.asarray(speed, x.dtype)
+    rate = (dx * dvx + dy * dvy) / safe
+    if doppler == "first":
+        return jnp.stack([angle, x[4] * (1 - rate / speed)])
+    away = (dx * x[2] + dy * x[3]) / safe  # the target's own part
+    return jnp.stack([angle, x[4] * (speed + away - rate) / (speed + away)])

@@ -21,4 +21,7 @@ from jaxfilt.wrappers.pseudo import hold_last as hold_last
 from jaxfilt.wrappers.pseudo import mean_of_recent as mean_of_recent
 from jaxfilt.wrappers.pseudo import polynomial_fit as polynomial_fit
 from jaxfilt.wrappers.pseudo import sinusoid_fit as sinusoid_fit
+from jaxfilt.wrappers.residual import nis_q as nis_q
+from jaxfilt.wrappers.residual import residual_r as residual_r
+from jaxfilt.wrappers.usable import usable_where as usable_where
 from jaxfilt.wrappers.variable_dimension import variable_dimension as variable_dimension

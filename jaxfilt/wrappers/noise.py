@@ -34,6 +34,7 @@ class _SageHusa(NamedTuple):
 class _Matching(NamedTuple):
     inner: Filter
     bounds: Any  # (2,)
+    rate: Any  # ()
     options: Static  # (scale, window)
 
 
@@ -108,7 +109,7 @@ def sage_husa(
 
 
 def covariance_matching(
-    filt: Filter, *, scale: str = "r", window: int = 30, bounds: tuple[Any, Any] | None = None
+    filt: Filter, *, scale: str = "r", window: int = 30, rate: Any = 1.0, bounds: tuple[Any, Any] | None = None
 ) -> Filter:
     """Makes the predicted innovation covariance match the observed one over the last samples, by R or by Q.
 
@@ -118,8 +119,9 @@ def covariance_matching(
         Q <- Q ratio^(1 / window),    ratio = sum_i mean(nu_i^2 - R_ii) / R_ii / sum_i mean(H P- H')_ii / R_ii
 
     The window starts full of what the model expects. The power 1 / window, where Ding and others have 1/2, is because a
-    window answers late: the ratio that it shows is that of the Q of half a window ago. What step k teaches is in force
-    from step k+1 on.
+    window answers late: the ratio that it shows is that of the Q of half a window ago. With ``rate < 1`` the estimate
+    goes only that part of the way from the last one to the new (for Q: the power is ``rate / window``). What step k
+    teaches is in force from step k+1 on.
 
     Quicker than :func:`sage_husa` where the filter trusts its measurements, and noisier: a difference of squares may be
     negative and then meets the lower bound. When it helps and when it harms is said there. Do not use it for R where
@@ -135,18 +137,20 @@ def covariance_matching(
         filt: reports innovation_cov and noise_cov, and honors the scale.
         scale: ``"r"`` or ``"q"``.
         window: samples per channel.
+        rate: in [0, 1]; 0 leaves the filter as it is. May be traced.
         bounds: smallest and largest factor; default (0.01, 100) for R, (1e-4, 1e4) for Q.
 
     Raises:
-        ValueError: window < 2, bounds not in order, an unknown scale; at trace time, a filter without innovation_cov or
-            noise_cov.
+        ValueError: window < 2, rate outside [0, 1], bounds not in order, an unknown scale; at trace time, a filter
+            without innovation_cov or noise_cov.
 
     Source: Mehra 1972; Maybeck 1982, section 10.8; for Q: Ding, Wang, Rizos and Kinlyside 2007.
     """
     check_count("window", window, 2)
+    check_rate(rate, closed=True)
     bounds = _check_scale(scale, bounds)
     return wrap(
-        _Matching(filt, bounds, Static((scale, window))),
+        _Matching(filt, bounds, rate, Static((scale, window))),
         init=_matching_init, predict=_scaled_predict, update=_matching_update,
     )  # fmt: skip
 
@@ -186,6 +190,13 @@ def check_forgetting(forgetting: Any) -> None:
     check_positive("forgetting", forgetting)
     if is_concrete(forgetting) and not (np.asarray(forgetting) < 1).all():
         raise ValueError(f"forgetting: expected a value in (0, 1), got {forgetting}")
+
+
+def check_rate(rate: Any, *, closed: bool = False) -> None:
+    """Raises a ValueError unless rate is in [0, 1), or with ``closed`` in [0, 1], if concrete."""
+    check_positive("rate", rate, zero=True)
+    if is_concrete(rate) and not (np.asarray(rate) < 1).all() and not (closed and (np.asarray(rate) == 1).all()):
+        raise ValueError(f"rate: expected a value in [0, 1{']' if closed else ')'}, got {rate}")
 
 
 def check_bounds(name: str, bounds: Any) -> tuple[Any, Any]:
@@ -299,13 +310,14 @@ def _matching_update(p, s, inp):
     if which == "r":
         values = _push(values, scale * _ratio(squared - predicted, variance), used)
         new, status = clip(jnp.mean(values, axis=0), p.bounds)
-        scale = jnp.where(used, new, scale)
+        rate = jnp.asarray(p.rate, scale.dtype)
+        scale = jnp.where(used, (1 - rate) * scale + rate * new, scale)
     else:
         observed = _push(values[0], _ratio(squared - variance, variance), used)
         predicted = _push(values[1], _ratio(predicted, variance), used)
         values = jnp.stack([observed, predicted])
         ratio = jnp.clip(_ratio(jnp.sum(observed), jnp.sum(predicted)), *Q_BOUNDS)
-        new, status = clip(scale * ratio ** (1 / window), p.bounds)
+        new, status = clip(scale * ratio ** (jnp.asarray(p.rate, scale.dtype) / window), p.bounds)
         scale = jnp.where(used.any(), new, scale)
     return _finish(p, inner, info, _Recent(scale, values), jnp.where(used.any(), status, jnp.int32(0)))
 

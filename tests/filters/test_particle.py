@@ -168,6 +168,68 @@ def test_gradient_is_that_of_the_same_draws():
     assert abs(slopes.mean() - jax.grad(kalman)(at)) <= 4.5 * slopes.std() / np.sqrt(7) + 0.02
 
 
+def test_the_score_correction_changes_no_bit_of_the_estimate():
+    found = [jf.filter(jf.particle(MODEL, 50, gradient=name, keep=True), YS, mask=MASK, key=KEYS[0])
+             for name in ("none", "score")]  # fmt: skip
+    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_array_equal(a, b)
+    ancestors = np.asarray(found[0].extra["ancestors"])
+    assert (np.diff(ancestors, axis=1) >= 0).all()
+    assert (ancestors != np.arange(50)).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "unbiased"),
+    [
+        ({"gradient": "score"}, True),
+        ({"gradient": "full_score"}, True),
+        ({"gradient": "score", "guide": jf.extended}, True),
+        ({"gradient": "full_score", "guide": jf.extended}, True),
+        ({"gradient": "score", "auxiliary": True}, True),
+        ({"gradient": "none"}, False),
+        ({"gradient": "none", "auxiliary": True}, False),
+        ({"gradient": "soft"}, False),
+    ],
+)
+def test_gradient_of_the_likelihood_estimate(options, unbiased):
+    """Beside the Kalman filter's: unbiased with the score correction, and biased without, by the same check."""
+
+    def value(theta, key, filt):
+        model = jf.models.linear_gaussian(
+            **{**LINEAR, "R": jnp.exp(theta[0]) * LINEAR["R"], "Q": jnp.exp(theta[1]) * LINEAR["Q"]}
+        )
+        out = jf.filter(filt(model), YS[:6], mask=jnp.ones((6, 2), bool).at[3].set(False), key=key)
+        return out.log_lik.sum()
+
+    theta = jnp.array([0.3, -0.2])
+    exact, slope = jax.value_and_grad(value)(theta, None, jf.kalman)
+
+    def one(theta, key):
+        particles = lambda m: jf.particle(m, 50, resampling="multinomial", threshold=1.0, **options)  # noqa: E731
+        return jnp.exp(value(theta, key, particles) - exact)
+
+    keys = jax.random.split(jax.random.key(2), 6000)
+    found = np.asarray(jax.jit(lambda keys: jax.lax.map(lambda k: jax.grad(one)(theta, k), keys, batch_size=500))(keys))
+    deviation = np.abs(found.mean(axis=0) - np.asarray(slope)) / (found.std(axis=0) / np.sqrt(len(keys)))
+    assert (deviation <= 4).all() if unbiased else (deviation > 6).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["f32", "f64"])
+@pytest.mark.parametrize("gradient", ["score", "full_score", "soft", "transport"])
+def test_gradients_survive_underflow_and_a_single_particle(gradient, dtype):
+    model = jax.tree.map(lambda x: x.astype(dtype), MODEL)
+    far = jnp.asarray(YS, dtype).at[4].set(1e4)
+
+    def value(scale, count):
+        filt = jf.particle(model._replace(R=scale * model.R), count, threshold=1.0, gradient=gradient, sweeps=10)
+        return jf.filter(filt, far, key=jax.random.key(0)).log_lik.sum()
+
+    for count in (1, 30):
+        assert all(np.isfinite(x) for x in jax.value_and_grad(value)(jnp.asarray(1.0, dtype), count))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -175,6 +237,12 @@ def test_gradient_is_that_of_the_same_draws():
         (lambda: jf.particle(MODEL, 2.5), "count: expected a whole number"),  # pyright: ignore[reportArgumentType]
         (lambda: jf.particle(MODEL, 5, resampling="none"), "resampling: expected one of"),
         (lambda: jf.particle(MODEL, 5, guide=jf.extended, auxiliary=True), "guide: not together with auxiliary"),
+        (lambda: jf.particle(MODEL, 5, gradient="exact"), "gradient: expected one of score, full_score, none"),
+        (lambda: jf.particle(MODEL, 5, gradient="soft", auxiliary=True), "gradient: 'soft' is another way"),
+        (lambda: jf.particle(MODEL, 5, gradient="soft", alpha=0.0), "alpha: expected a finite value > 0"),
+        (lambda: jf.particle(MODEL, 5, gradient="soft", alpha=1.1), "1 - alpha: expected"),
+        (lambda: jf.particle(MODEL, 5, gradient="transport", epsilon=0.0), "epsilon: expected a finite value > 0"),
+        (lambda: jf.particle(MODEL, 5, gradient="transport", sweeps=0), "sweeps: expected a whole number"),
         (lambda: jf.particle(MODEL, 5, threshold=1.5), "threshold: expected"),
         (lambda: jf.particle(MODEL, 5, threshold=-0.1), "threshold: expected"),
         (lambda: jf.filter(jf.particle(MODEL, 5), YS), "key: a particle filter draws random numbers"),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfilt.filters.resampling import SCHEMES, ancestors, effective_sample_size
+from jaxfilt.filters.resampling import SCHEMES, ancestors, effective_sample_size, score_correction, soften, transport
 
 schemes = pytest.mark.parametrize("scheme", SCHEMES)
 
@@ -62,6 +62,35 @@ def test_awkward_weights(scheme, dtype):
 def test_effective_sample_size():
     assert float(effective_sample_size(jnp.full((10,), -np.log(10)))) == pytest.approx(10.0)
     assert float(effective_sample_size(jnp.array([0.0, -jnp.inf]))) == pytest.approx(1.0)
+
+
+def test_score_correction_is_zero_with_the_slope_of_what_was_drawn():
+    log_weights, index = jnp.log(jnp.array([0.2, 0.3, 0.5])), jnp.array([2, 2, 0])
+    value, slope = jax.jvp(lambda x: score_correction(x, index), (log_weights,), (jnp.array([1.0, 2.0, 3.0]),))
+    assert value.tolist() == [0.0, 0.0, 0.0]
+    assert slope.tolist() == [3.0, 3.0, 1.0]
+
+
+def test_soft_weights():
+    weights = jnp.array([0.0, 0.25, 0.75])
+    np.testing.assert_allclose(jnp.exp(soften(jnp.log(weights), 0.4)), 0.4 * weights + 0.2, rtol=1e-12)
+
+
+def test_transport_keeps_the_mean_and_in_one_dimension_the_order():
+    """A small epsilon gives the quantiles of the weighted cloud; units do not matter; what cannot move stays."""
+    x = jnp.sort(jax.random.normal(jax.random.key(0), (40, 1)), axis=0) * jnp.array([[1e4, 0.0]])
+    log_weights = jax.nn.log_softmax(-0.5 * (x[:, 0] / 1e4 - 1) ** 2 / 0.3)
+    moved = transport(x, log_weights, 0.02, 1000)
+    np.testing.assert_allclose(moved.mean(axis=0), jnp.exp(log_weights) @ x, rtol=1e-9)
+    assert (jnp.diff(moved[:, 0]) > 0).all()
+    assert (moved[:, 1] == 0).all()
+    # Without regularization place j is the mean of the quantiles between j / N and (j + 1) / N.
+    cumulated = np.cumsum(np.exp(log_weights))
+    quantiles = np.asarray(x)[np.searchsorted(cumulated / cumulated[-1], (np.arange(40_000) + 0.5) / 40_000), 0]
+    error = np.sqrt(np.mean((moved[:, 0] - quantiles.reshape(40, 1000).mean(axis=1)) ** 2))
+    assert error < np.sqrt(0.02) * x[:, 0].std()  # the plan is blurred by sqrt(epsilon n / 2) standard deviations
+    one = jnp.full((40,), -1e300).at[3].set(0.0)
+    np.testing.assert_allclose(transport(x, one, 0.02, 1000), jnp.broadcast_to(x[3], x.shape), rtol=1e-6)
 
 
 def test_unknown_scheme_is_refused():
