@@ -1,0 +1,1 @@
+"""Roll and pitch of a body that is accelerated."""

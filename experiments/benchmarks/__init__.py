@@ -1,0 +1,1 @@
+"""Against peers: commands that print ratios measured in one run."""
