@@ -7,6 +7,7 @@ from jaxfilt import maneuver as maneuver
 from jaxfilt import metrics as metrics
 from jaxfilt import models as models
 from jaxfilt import simulate as simulate
+from jaxfilt import sincos as sincos
 from jaxfilt import tune as tune
 from jaxfilt.core import Filter as Filter
 from jaxfilt.core import Info as Info
@@ -25,6 +26,8 @@ from jaxfilt.core import scan as scan
 from jaxfilt.core import step as step
 from jaxfilt.core import summary as summary
 from jaxfilt.core import wrap as wrap
+from jaxfilt.ellipse import EllipseFit as EllipseFit
+from jaxfilt.ellipse import fit_ellipse as fit_ellipse
 from jaxfilt.filters import adaptive_delayed_kalman as adaptive_delayed_kalman
 from jaxfilt.filters import alpha_beta as alpha_beta
 from jaxfilt.filters import alpha_beta_gamma as alpha_beta_gamma
@@ -40,6 +43,7 @@ from jaxfilt.filters import extended as extended
 from jaxfilt.filters import gains as gains
 from jaxfilt.filters import hinf as hinf
 from jaxfilt.filters import imm as imm
+from jaxfilt.filters import interval_observer as interval_observer
 from jaxfilt.filters import joint_particle as joint_particle
 from jaxfilt.filters import kalman as kalman
 from jaxfilt.filters import madgwick as madgwick
@@ -85,6 +89,7 @@ from jaxfilt.wrappers import mean_of_recent as mean_of_recent
 from jaxfilt.wrappers import nearest_neighbor as nearest_neighbor
 from jaxfilt.wrappers import nis_q as nis_q
 from jaxfilt.wrappers import p_inflated as p_inflated
+from jaxfilt.wrappers import phase_locked as phase_locked
 from jaxfilt.wrappers import polynomial_fit as polynomial_fit
 from jaxfilt.wrappers import q_inflated as q_inflated
 from jaxfilt.wrappers import residual_r as residual_r
@@ -93,3 +98,4 @@ from jaxfilt.wrappers import scan_inputs as scan_inputs
 from jaxfilt.wrappers import sinusoid_fit as sinusoid_fit
 from jaxfilt.wrappers import usable_where as usable_where
 from jaxfilt.wrappers import variable_dimension as variable_dimension
+from jaxfilt.wrappers import watched as watched

@@ -14,18 +14,20 @@ from tests.examples import (
     delayed,
     hinf,
     imm,
+    interval,
     joint,
     linear,
     noise,
     nonlinear,
     particle,
     rao_blackwellized,
+    sincos,
 )
 
 REGISTRY: dict[str, Example] = {
     **adaptive.EXAMPLES, **attitude.EXAMPLES, **bearing.EXAMPLES, **delayed.EXAMPLES, **hinf.EXAMPLES,
-    **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES, **joint.EXAMPLES, **noise.EXAMPLES, **particle.EXAMPLES,
-    **rao_blackwellized.EXAMPLES,
+    **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES, **interval.EXAMPLES, **joint.EXAMPLES, **noise.EXAMPLES,
+    **particle.EXAMPLES, **rao_blackwellized.EXAMPLES, **sincos.EXAMPLES,
 }  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from jaxfilt.filters.hinf import riccati as riccati
 from jaxfilt.filters.hinf import sqrt_mixed_hinf as sqrt_mixed_hinf
 from jaxfilt.filters.hinf import theta_max as theta_max
 from jaxfilt.filters.imm import imm as imm
+from jaxfilt.filters.interval import interval_observer as interval_observer
 from jaxfilt.filters.joint_particle import joint_particle as joint_particle
 from jaxfilt.filters.joint_particle import multi_mode_particle as multi_mode_particle
 from jaxfilt.filters.kalman import kalman as kalman

@@ -16,6 +16,7 @@ from jaxfilt.models.nonlinear import Sensor as Sensor
 from jaxfilt.models.nonlinear import as_nonlinear as as_nonlinear
 from jaxfilt.models.nonlinear import nonlinear as nonlinear
 from jaxfilt.models.nonlinear import with_sensor as with_sensor
+from jaxfilt.models.sincos import sine_cosine as sine_cosine
 from jaxfilt.models.singer import maneuver_variance as maneuver_variance
 from jaxfilt.models.singer import singer as singer
 from jaxfilt.models.turn import coordinated_turn as coordinated_turn

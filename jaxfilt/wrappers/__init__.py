@@ -17,6 +17,7 @@ from jaxfilt.wrappers.intersection import covariance_intersection as covariance_
 from jaxfilt.wrappers.noise import covariance_matching as covariance_matching
 from jaxfilt.wrappers.noise import fading_memory as fading_memory
 from jaxfilt.wrappers.noise import sage_husa as sage_husa
+from jaxfilt.wrappers.phase_locked import phase_locked as phase_locked
 from jaxfilt.wrappers.pseudo import hold_last as hold_last
 from jaxfilt.wrappers.pseudo import mean_of_recent as mean_of_recent
 from jaxfilt.wrappers.pseudo import polynomial_fit as polynomial_fit
@@ -25,3 +26,4 @@ from jaxfilt.wrappers.residual import nis_q as nis_q
 from jaxfilt.wrappers.residual import residual_r as residual_r
 from jaxfilt.wrappers.usable import usable_where as usable_where
 from jaxfilt.wrappers.variable_dimension import variable_dimension as variable_dimension
+from jaxfilt.wrappers.watch import watched as watched
