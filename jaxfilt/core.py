@@ -22,7 +22,10 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
+from jaxfilt.linalg import scalar_scan, scalarize
+
 PyTree = Any
+_FEW = 8  # runs below which matrices are as fast as scalars
 
 
 class Status(enum.IntFlag):
@@ -230,6 +233,7 @@ def filter(
     r_scale: Any = None,
     outputs: Callable[[PyTree, Info], PyTree] = summary,
     first_update_only: bool = False,
+    form: str = "auto",
 ) -> Any:
     """Filters one series: ``init``, then a ``lax.scan`` over time. Batch it with ``jax.vmap``.
 
@@ -247,6 +251,11 @@ def filter(
         r_scale: factor on R, scalar, (T,) or (T, m).
         outputs: ``(state, info) -> pytree`` inside the scan; :func:`summary` or :func:`everything`, or your own.
         first_update_only: takes the model's m0, P0 as the prior on the first sample.
+        form: ``"dense"`` computes with matrices; ``"scalar"`` with their entries one by one, which for small systems
+            in large batches is many times faster on CPUs (:mod:`jaxfilt.linalg.scalarize`). ``"auto"``: scalar under a
+            ``vmap`` over 8 or more runs, if the step is small enough and has a scalar form. A matrix entry that is 0
+            counts as 0 for good if its value can be seen here: build the filter outside ``jit``, or within the function
+            under ``jit``, not as its argument.
 
     Returns:
         The stacked outputs; with :func:`summary` an :class:`Info` with leading T: ``mean (T, n)``, ``cov (T, n, n)``,
@@ -255,10 +264,15 @@ def filter(
     Raises:
         ValueError: wrong shapes, T = 0, negative dt, or (concrete arrays only) a NaN or infinite value that no mask
             covers. Under a transformation such a value sets ``Status.NONFINITE`` and its innovation is ignored.
+        ValueError: ``form="scalar"`` for a step that has none; says why.
         TypeError: integer arrays, or another float dtype than the model's.
     """
     stacked = inputs(ys, mask=mask, dt=dt, u=u, key=key, q_scale=q_scale, r_scale=r_scale)
-    return _filter(filt, stacked, key, outputs, first_update_only)
+    if form not in ("auto", "dense", "scalar"):
+        raise ValueError(f'form: expected "auto", "dense" or "scalar", got {form!r}')
+    scalar = form == "scalar" or (form == "auto" and _runs((filt, stacked)) >= _FEW)
+    zeros = scalarize.zeros(filt) if scalar else None
+    return _filter(filt, stacked, key, outputs, first_update_only, form, zeros)
 
 
 def mask_nan(ys: Any) -> tuple[Array, Array]:
@@ -331,28 +345,55 @@ def inputs(
     return StepInput(ys, mask, dt, jax.tree.map(jnp.asarray, u), keys, q_scale, r_scale)
 
 
-@partial(jax.jit, static_argnames=("outputs", "first_update_only"))
-def _filter(filt, stacked, key, outputs, first_update_only):
+@partial(jax.jit, static_argnames=("outputs", "first_update_only", "form", "zeros"))
+def _filter(filt, stacked, key, outputs, first_update_only, form, zeros):
+    if zeros is not None and key is None:
+        step = partial(_step_of, outputs=outputs)
+        xs = stacked, _is_first(stacked, first_update_only)
+        try:
+            limit = scalar_scan.MOST if form == "scalar" else scalar_scan.WORTHWHILE
+            return scalar_scan.scan(_checked_init, step, filt, xs, zeros, limit=limit)
+        except scalarize.NoScalarForm as reason:
+            if form == "scalar":
+                raise ValueError(f'form: "scalar" is not possible here: {reason}') from None
+    elif form == "scalar":
+        raise ValueError('form: "scalar" is not possible for a filter that draws random numbers')
     first = jax.tree.map(lambda leaf: leaf[0], stacked)
     if key is not None:
         first = first._replace(key=jax.random.fold_in(key, 0))
+    state = _checked_init(filt, (first, None))
+    return _scan(filt, state, stacked, outputs, first_update_only)[1]
+
+
+def _checked_init(filt, x):
+    first, _ = x
     state = filt.init(first)
     for leaf in jax.tree.leaves(state):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != first.y.dtype:
             raise TypeError(f"ys: is {first.y.dtype}, but the filter's model is {leaf.dtype}; convert one of them")
-    return _scan(filt, state, stacked, outputs, first_update_only)[1]
+    return state
 
 
 @partial(jax.jit, static_argnames=("outputs", "first_update_only"))
 def _scan(filt, state, stacked, outputs, first_update_only):
-    def body(state, x):
-        inp, is_first = x
-        state, info = _step(filt, state, inp, is_first)
-        return state, outputs(state, info)
+    body = partial(_step_of, filt, outputs=outputs)
+    return jax.lax.scan(body, state, (stacked, _is_first(stacked, first_update_only)))
 
-    # The step's index is shared by all runs of a batch, so this `where` costs nothing under vmap.
-    is_first = jnp.arange(stacked.y.shape[0]) == 0 if first_update_only else None
-    return jax.lax.scan(body, state, (stacked, is_first))
+
+def _step_of(filt, state, x, outputs):
+    inp, is_first = x
+    state, info = _step(filt, state, inp, is_first)
+    return state, outputs(state, info)
+
+
+def _is_first(stacked, first_update_only):
+    # The step's index is shared by all runs of a batch, so the `where` it decides costs nothing under vmap.
+    return jnp.arange(stacked.y.shape[0]) == 0 if first_update_only else None
+
+
+def _runs(tree):
+    """How many runs ``vmap`` computes at once here."""
+    return max((size for leaf in jax.tree.leaves(tree) for size in scalarize.batch_sizes(leaf)), default=1)
 
 
 def _step(filt, state, inp, skip_prediction):

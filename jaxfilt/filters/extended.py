@@ -12,7 +12,7 @@ from jax import Array
 from jaxfilt.core import Filter, Info, Prediction, Static, StepInput, bind
 from jaxfilt.filters.common import check_dtype, check_measurement
 from jaxfilt.filters.update import array_update, joseph_update
-from jaxfilt.linalg import chol, scale_cov, sym, tria
+from jaxfilt.linalg import chol, mirror, scale_cov, sym, tria
 from jaxfilt.models.linear import LinearGaussian
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance, jacobian
 
@@ -162,13 +162,13 @@ def _iterate(p, inp: StepInput, mean: Array, predicted: Array, H: Array, update:
 
 
 def _init(p, inp):
-    return ExtendedState(init_mean(p.model, inp), p.model.P0)
+    return ExtendedState(init_mean(p.model, inp), sym(p.model.P0))
 
 
 def _predict(p, state, inp):
     mean, F, Q = _transition(p, inp, state.mean, state.cov)
     cross = state.cov @ F.T
-    cov = sym(F @ cross + Q)
+    cov = mirror(F @ cross) + sym(Q)
     return ExtendedState(mean, cov), Prediction(mean, cov, cross)
 
 

@@ -10,7 +10,7 @@ from jax import Array
 from jaxfilt.core import Filter, Prediction, StepInput, bind
 from jaxfilt.filters.common import check_measurement, decoupled, masked_rows
 from jaxfilt.filters.update import joseph_update
-from jaxfilt.linalg import chol, scale_cov, solve_chol, sym
+from jaxfilt.linalg import chol, mirror, scale_cov, solve_chol, sym
 from jaxfilt.models.linear import LinearGaussian, value
 
 
@@ -78,7 +78,7 @@ def effective_dynamics(
 ) -> tuple[Array, Array, Array | None]:
     """``(F, Q, shift)`` of a prediction, correlated noise taken into account; shift is the whole input term."""
     F = value(model.F, inp.u, inp.dt)
-    Q = scale_cov(value(model.Q, inp.u, inp.dt), inp.q_scale)
+    Q = sym(scale_cov(value(model.Q, inp.u, inp.dt), inp.q_scale))
     shift = input_term(model.B, inp)
     if correlated is not None:
         F, Q = F - correlated.JH, sym(Q - correlated.JS)
@@ -122,14 +122,14 @@ def correlate(
 
 
 def _init(model, inp):
-    return KalmanState(init_mean(model, inp), model.P0, init_correlated(model))
+    return KalmanState(init_mean(model, inp), sym(model.P0), init_correlated(model))
 
 
 def _predict(model, state, inp):
     F, Q, shift = effective_dynamics(model, inp, state.correlated)
     mean = propagate(F, state.mean, shift, state.correlated)
     cross = state.cov @ F.T
-    cov = sym(F @ cross + Q)
+    cov = mirror(F @ cross) + Q
     return KalmanState(mean, cov, state.correlated), Prediction(mean, cov, cross)
 
 

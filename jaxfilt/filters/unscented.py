@@ -12,7 +12,7 @@ from jax import Array
 from jaxfilt.core import Filter, Prediction, Static, Status, bind, flag, is_concrete
 from jaxfilt.filters.extended import init_mean
 from jaxfilt.filters.update import array_update, factor_update
-from jaxfilt.linalg import chol, scale_cov, solve_lower, sym, tria
+from jaxfilt.linalg import chol, mirror, scale_cov, solve_lower, sym, tria
 from jaxfilt.models.linear import LinearGaussian, common_dtype
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance
 
@@ -165,13 +165,13 @@ def _whitened(L, v):
 
 def _total(p, out, P):
     """``(P + B B' - v v', status)``, with v dropped where that is not PSD."""
-    P = sym(P + out.B @ out.B.T)
+    P = sym(P) + mirror(out.B @ out.B.T)
     if not p.downdates.value:
         return P, out.status
     L = chol(P)
     x, status = _whitened(L, out.v)
     v = L @ x
-    return sym(P - v[:, None] * v[None, :]), out.status | status
+    return mirror(P - v[:, None] * v[None, :]), out.status | status
 
 
 def _transition(p, state, inp, L):

@@ -18,6 +18,11 @@ def sym(A: Array) -> Array:
     return 0.5 * (A + A.T)
 
 
+def mirror(A: Array) -> Array:
+    """A (n, n) with its lower triangle mirrored, for products that are symmetric but for rounding, as F P F'."""
+    return jnp.where(np.tri(A.shape[0], dtype=bool), A, A.T)
+
+
 def scale_cov(A: Array, scale: Array | None) -> Array:
     """D A D with D = diag(sqrt(scale)); ``scale`` is None, () or (n,)."""
     if scale is None:

@@ -1,0 +1,153 @@
+"""``lax.scan`` of a small-matrix step as a scan over scalars; see :mod:`jaxfilt.linalg.scalarize`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxfilt.linalg.scalarize import Interpreter, NoScalarForm, assemble, entries
+
+PyTree = Any
+
+# Scalar operations in one step up to which the scalar form runs faster than the dense one; and the most it may have.
+WORTHWHILE, MOST = 1500, 20_000
+
+
+def scan(
+    init: Callable[[PyTree, PyTree], PyTree],
+    step: Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]],
+    params: PyTree,
+    xs: PyTree,
+    zeros: tuple[tuple[tuple[int, ...], bytes] | None, ...],
+    *,
+    limit: int,
+) -> PyTree:
+    """The stacked outputs of ``step`` over the leading axis of ``xs``, from ``init(params, first x)``.
+
+    Only what varies is carried: entries of the state that stay equal to each other (the two triangles of a covariance)
+    are carried once, those that keep a known value (zeros) not at all. Which these are is found by assuming all that
+    holds of the initial state and dropping what a step breaks, until a step breaks nothing.
+
+    Args:
+        init: ``(params, x) -> state``.
+        step: ``(params, state, x) -> (state, outputs)``.
+        params: pytree of arrays.
+        xs: pytree with leading T.
+        zeros: for each leaf of ``params`` None, or shape and bytes of a bool array: where it is known to be 0.
+        limit: largest number of scalar operations in a step.
+
+    Raises:
+        NoScalarForm: more operations than ``limit``, too large an array, or a primitive that has no scalar form.
+    """
+    first = jax.tree.map(lambda leaf: leaf[0], xs)
+    const = []
+    for leaf, known_zeros in zip(jax.tree.leaves(params), zeros, strict=True):
+        where = None if known_zeros is None else np.frombuffer(known_zeros[1], bool).reshape(known_zeros[0])
+        const.append(entries(leaf, where))
+
+    closed = jax.make_jaxpr(init)(params, first)
+    start = Interpreter(limit)
+    state = start.run_closed(closed, [*const, *(entries(x) for x in jax.tree.leaves(first))])
+    _refuse(start.opaque)
+    state_avals = [v.aval for v in closed.jaxpr.outvars]
+    state_tree = jax.tree.structure(jax.eval_shape(init, params, first))
+    spec = jax.tree.unflatten(state_tree, [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in state_avals])
+    closed = jax.make_jaxpr(step)(params, spec, first)
+    _, out_spec = jax.eval_shape(step, params, spec, first)
+    out_tree = jax.tree.structure(out_spec)
+    out_avals = [v.aval for v in closed.jaxpr.outvars[len(state_avals) :]]
+
+    flat = [x for entry in state for x in entry.ravel()]
+    dtypes = [a.dtype for a, entry in zip(state_avals, state, strict=True) for _ in range(entry.size)]
+    rows = [leaf for leaf in jax.tree.leaves(xs)]
+    split = [_columns(leaf) for leaf in rows]
+
+    def run(classes, carry, x):
+        """One step: ``(flat entries of the next state, entries of the outputs)``."""
+        interpreter = Interpreter(limit)
+        values = [c if isinstance(c, np.generic) else carry[c] for c in classes]
+        at, ins = 0, []
+        for entry in state:
+            array = np.empty(entry.shape, object)
+            for k, index in enumerate(np.ndindex(entry.shape)):
+                array[index] = values[at + k]
+            at += entry.size
+            ins.append(array)
+        inputs = []
+        for leaf, columns in zip(rows, x, strict=True):
+            array = np.empty(leaf.shape[1:], object)
+            for index, column in zip(np.ndindex(array.shape), columns, strict=True):
+                array[index] = column
+            inputs.append(array)
+        out = interpreter.run_closed(closed, [*const, *ins, *inputs])
+        _refuse(interpreter.opaque)
+        return [y for entry in out[: len(state)] for y in entry.ravel()], out[len(state) :]
+
+    classes = _classes(flat, dtypes, [None] * len(flat))
+    while True:
+        after: list[Any] = []
+
+        def trace(carry, x, classes=classes, after=after):
+            after[:] = run(classes, carry, x)[0]
+            return 0
+
+        carry = _carry(classes, flat, dtypes)
+        jax.eval_shape(trace, carry, jax.tree.map(lambda column: column[0], split))
+        refined = _classes(after, dtypes, classes)
+        if refined == classes:
+            break
+        classes = refined
+
+    def body(carry, x):
+        after, outs = run(classes, carry, x)
+        return _carry(classes, after, dtypes), [assemble(y, a) for y, a in zip(outs, out_avals, strict=True)]
+
+    # Checkpointed: the reverse pass keeps the carry only and computes one step again.
+    body = jax.checkpoint(body, prevent_cse=False)
+    _, outs = lax.scan(body, _carry(classes, flat, dtypes), split)
+    return jax.tree.unflatten(out_tree, outs)
+
+
+def _columns(leaf):
+    """An input (T, ...) as one (T,) array per entry: over a batch these are contiguous rows, not columns."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
+        raise NoScalarForm("random keys")
+    return [leaf[(slice(None), *index)] for index in np.ndindex(leaf.shape[1:])]
+
+
+def _refuse(opaque):
+    if left := set(opaque) - {"eigh"}:  # which costs the same in either form
+        raise NoScalarForm(f"no scalar form of {', '.join(sorted(left))}")
+
+
+def _classes(flat, dtypes, before):
+    """Numbers the distinct traced entries among those of one class before; known entries that were known stay so."""
+    numbers: dict[Any, int] = {}
+    out: list[Any] = []
+    for x, dtype, old in zip(flat, dtypes, before, strict=True):
+        if isinstance(x, np.generic) and (
+            old is None or (isinstance(old, np.generic) and old.tobytes() == x.tobytes())
+        ):
+            out.append(x)
+        else:
+            was = old.tobytes() if isinstance(old, np.generic) else old
+            now = x.tobytes() if isinstance(x, np.generic) else id(x)
+            out.append(numbers.setdefault((dtype.str, was, now), len(numbers)))
+    return out
+
+
+def _same(a, b):
+    return a.tobytes() == b.tobytes()
+
+
+def _carry(classes, flat, dtypes):
+    carry: dict[int, Any] = {}
+    for c, x, dtype in zip(classes, flat, dtypes, strict=True):
+        if not isinstance(c, np.generic) and c not in carry:
+            carry[c] = lax.convert_element_type(x, dtype)
+    return [carry[c] for c in range(len(carry))]
