@@ -14,7 +14,7 @@ from jaxfilt.linalg.scalarize import Interpreter, NoScalarForm, assemble, entrie
 
 PyTree = Any
 
-# Scalar operations in one step up to which the scalar form runs faster than the dense one; and the most it may have.
+# Scalar operations in a step up to which the scalar form runs faster than the dense one, and the most that are traced.
 WORTHWHILE, MOST = 1500, 20_000
 
 
@@ -39,7 +39,7 @@ def scan(
         params: pytree of arrays.
         xs: pytree with leading T.
         zeros: for each leaf of ``params`` None, or shape and bytes of a bool array: where it is known to be 0.
-        limit: largest number of scalar operations in a step.
+        limit: largest number of scalar operations in a step, those that the outputs do not need apart.
 
     Raises:
         NoScalarForm: more operations than ``limit``, too large an array, or a primitive that has no scalar form.
@@ -51,7 +51,7 @@ def scan(
         const.append(entries(leaf, where))
 
     closed = jax.make_jaxpr(init)(params, first)
-    start = Interpreter(limit)
+    start = Interpreter(MOST)
     state = start.run_closed(closed, [*const, *(entries(x) for x in jax.tree.leaves(first))])
     _refuse(start.opaque)
     state_avals = [v.aval for v in closed.jaxpr.outvars]
@@ -68,8 +68,8 @@ def scan(
     split = [_columns(leaf) for leaf in rows]
 
     def run(classes, carry, x):
-        """One step: ``(flat entries of the next state, entries of the outputs)``."""
-        interpreter = Interpreter(limit)
+        """One step: ``(flat entries of the next state, entries of the outputs, operations that they need)``."""
+        interpreter = Interpreter(MOST)
         values = [c if isinstance(c, np.generic) else carry[c] for c in classes]
         at, ins = 0, []
         for entry in state:
@@ -86,25 +86,28 @@ def scan(
             inputs.append(array)
         out = interpreter.run_closed(closed, [*const, *ins, *inputs])
         _refuse(interpreter.opaque)
-        return [y for entry in out[: len(state)] for y in entry.ravel()], out[len(state) :]
+        flat = [y for entry in out for y in entry.ravel()]
+        return flat[: len(classes)], out[len(state) :], interpreter.needed(flat)
 
     classes = _classes(flat, dtypes, [None] * len(flat))
     while True:
         after: list[Any] = []
 
         def trace(carry, x, classes=classes, after=after):
-            after[:] = run(classes, carry, x)[0]
+            after[:] = run(classes, carry, x)
             return 0
 
         carry = _carry(classes, flat, dtypes)
         jax.eval_shape(trace, carry, jax.tree.map(lambda column: column[0], split))
-        refined = _classes(after, dtypes, classes)
+        refined = _classes(after[0], dtypes, classes)
         if refined == classes:
             break
         classes = refined
+    if after[2] > limit:
+        raise NoScalarForm(f"more than {limit} scalar operations")
 
     def body(carry, x):
-        after, outs = run(classes, carry, x)
+        after, outs, _ = run(classes, carry, x)
         return _carry(classes, after, dtypes), [assemble(y, a) for y, a in zip(outs, out_avals, strict=True)]
 
     # Checkpointed: the reverse pass keeps the carry only and computes one step again.
@@ -130,9 +133,8 @@ def _classes(flat, dtypes, before):
     numbers: dict[Any, int] = {}
     out: list[Any] = []
     for x, dtype, old in zip(flat, dtypes, before, strict=True):
-        if isinstance(x, np.generic) and (
-            old is None or (isinstance(old, np.generic) and old.tobytes() == x.tobytes())
-        ):
+        stayed = old is None or (isinstance(old, np.generic) and isinstance(x, np.generic) and _same(old, x))
+        if isinstance(x, np.generic) and stayed:
             out.append(x)
         else:
             was = old.tobytes() if isinstance(old, np.generic) else old

@@ -46,7 +46,8 @@ class Interpreter:
         self.opaque: list[str] = []  # primitives that ran on arrays
         self.limit = limit
         self._known: dict[Any, Any] = {}
-        self._keep: list[Any] = []  # ids in the keys of _known stay valid
+        self._inputs: dict[int, tuple[Any, ...]] = {}  # by id of what was emitted; keeps all values, so ids stay valid
+        self._weights: dict[int, int] = {}  # operations of what is more than one
 
     def run(self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
         """The outputs, as entries, of an open jaxpr."""
@@ -138,8 +139,19 @@ class Interpreter:
             if self.count > self.limit:
                 raise NoScalarForm(f"more than {self.limit} scalar operations")
             self._known[key] = plain(*xs) if plain else primitive.bind(*xs, **params)
-            self._keep.extend(xs)
+            self._inputs[id(self._known[key])] = xs
         return self._known[key]
+
+    def needed(self, outputs: Any) -> int:
+        """How many of the operations emitted the ``outputs`` (scalars) need; the compiler leaves the others out."""
+        seen: set[int] = set()
+        todo = list(outputs)
+        while todo:
+            x = todo.pop()
+            if id(x) not in seen and id(x) in self._inputs:
+                seen.add(id(x))
+                todo.extend(self._inputs[id(x)])
+        return sum(self._weights.get(i, 1) for i in seen)
 
     def _choose(self, condition, a, b):
         """Entries of a where the scalar condition holds, else of b."""
@@ -682,6 +694,7 @@ def _custom_jvp(self, eqn, ins):
     if not traced:
         return self.run_closed(eqn.params["call_jaxpr"], ins)
     known_outputs: list[Any] = []
+    weight: list[int] = []
 
     def arrays(scalars, rest):
         values = list(rest)
@@ -696,7 +709,7 @@ def _custom_jvp(self, eqn, ins):
     def program(*scalars):
         inner = Interpreter(self.limit)
         out = inner.run_closed(eqn.params["call_jaxpr"], arrays(scalars, flat))
-        self.count += inner.count
+        weight[:] = [inner.count]
         numbers: dict[int, int] = {}  # entries that are the same are one output, known ones are none
         known_outputs[:] = [_numbered(entry, numbers) for entry in out]
         distinct = {id(x): x for entry in out for x in entry.ravel()}
@@ -727,6 +740,10 @@ def _custom_jvp(self, eqn, ins):
         return tuple(a for a, _ in ordered), tuple(b for _, b in ordered)
 
     values = f(*(flat[i] for i in traced))
+    self.count += weight[0]
+    for x in values:
+        self._inputs[id(x)] = (*(flat[i] for i in traced), *values)
+        self._weights[id(x)] = weight[0] if x is values[0] else 0
     result = []
     for numbers, constants in known_outputs:
         array = constants.copy()
