@@ -333,11 +333,15 @@ def _weigh(log_c, log_liks, mask):
     finite = jnp.isfinite(log_liks)
     never = _never(log_c.dtype)
     joint = log_c + jnp.where(finite, log_liks, never)
-    log_lik = jax.nn.logsumexp(joint)
+    # Less the largest first: beside log-likelihoods of -1e6 single precision has no digits left for probabilities.
+    largest = jax.lax.stop_gradient(joint.max())
+    joint = joint - largest
+    normalizer = jax.nn.logsumexp(joint)
+    log_lik = largest + normalizer
     usable = finite.any()
     status = flag(~usable, Status.NONFINITE)
     told = usable if mask is None else usable & mask.any()
-    log_mu = jnp.where(told, joint - log_lik, log_c)
+    log_mu = jnp.where(told, joint - normalizer, log_c)
     if mask is not None:
         log_lik = jnp.where(mask.any(), log_lik, jnp.zeros((), log_lik.dtype))
     return log_mu, log_lik, status

@@ -12,15 +12,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxfilt.linalg.scalarize import instead
+
 
 def sym(A: Array) -> Array:
     """The symmetric part of A (n, n), symmetric to the bit."""
     return 0.5 * (A + A.T)
 
 
+@jax.jit
 def mirror(A: Array) -> Array:
-    """A (n, n) with its lower triangle mirrored, for products that are symmetric but for rounding, as F P F'."""
+    """As :func:`sym`, for products that are symmetric but for rounding, as F P F': on scalars one triangle serves."""
+    return sym(A)
+
+
+def _lower_mirrored(A):
     return jnp.where(np.tri(A.shape[0], dtype=bool), A, A.T)
+
+
+instead(mirror, _lower_mirrored, (2,), lambda A: True)
 
 
 def scale_cov(A: Array, scale: Array | None) -> Array:

@@ -72,8 +72,7 @@ class Interpreter:
             if name == "jit" and params["name"] in _INSTEAD:
                 out = self._shorter(ins, *_INSTEAD[params["name"]])
                 if out is not None:
-                    ranks = [v.aval.ndim for v in eqn.outvars]  # an output that is the same in all rows has no rows
-                    return [x if x.ndim == rank else _array(x[0]) for x, rank in zip(out, ranks, strict=True)]
+                    return out
             return self.run_closed(inner, ins)
         if name in _ELEMENTWISE:
             return [self._elementwise(eqn, ins)]
@@ -85,16 +84,8 @@ class Interpreter:
 
     def _shorter(self, ins, program, ranks, serves):
         """What the other program gives (see :func:`instead`), or None if it does not serve."""
-        batched = [x.ndim > rank for x, rank in zip(ins, ranks[-len(ins) :], strict=True)]
-        if any(batched):  # by a vmap within the step, over models for example
-            size = next(x.shape[0] for x, along in zip(ins, batched, strict=True) if along)
-            outs = []
-            for i in range(size):
-                row = [x[i] if along else x for x, along in zip(ins, batched, strict=True)]
-                outs.append(self._shorter([_array(x) for x in row], program, ranks, serves))
-                if outs[-1] is None:
-                    return None
-            return [np.stack(column) for column in zip(*outs, strict=True)]
+        if any(x.ndim != rank for x, rank in zip(ins, ranks[-len(ins) :], strict=True)):
+            return None  # under a vmap within the step, along axes that cannot be told from the shapes
         if not serves(*ins):
             return None
         missing = len(ranks) - len(ins)  # leading arguments that are None
