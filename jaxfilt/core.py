@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.linalg import scalar_scan, scalarize
+from jaxfilt.linalg import entries, scalar_scan
 
 PyTree = Any
 _FEW = 8  # runs below which matrices are as fast as scalars
@@ -271,7 +271,7 @@ def filter(
     if form not in ("auto", "dense", "scalar"):
         raise ValueError(f'form: expected "auto", "dense" or "scalar", got {form!r}')
     scalar = form == "scalar" or (form == "auto" and _runs((filt, stacked)) >= _FEW)
-    zeros = scalarize.zeros(filt) if scalar else None
+    zeros = entries.zeros(filt) if scalar else None
     return _filter(filt, stacked, key, outputs, first_update_only, form, zeros)
 
 
@@ -353,7 +353,7 @@ def _filter(filt, stacked, key, outputs, first_update_only, form, zeros):
         try:
             limit = scalar_scan.MOST if form == "scalar" else scalar_scan.WORTHWHILE
             return scalar_scan.scan(_checked_init, step, filt, xs, zeros, limit=limit)
-        except scalarize.NoScalarForm as reason:
+        except entries.NoScalarForm as reason:
             if form == "scalar":
                 raise ValueError(f'form: "scalar" is not possible here: {reason}') from None
     elif form == "scalar":
@@ -393,7 +393,7 @@ def _is_first(stacked, first_update_only):
 
 def _runs(tree):
     """How many runs ``vmap`` computes at once here."""
-    return max((size for leaf in jax.tree.leaves(tree) for size in scalarize.batch_sizes(leaf)), default=1)
+    return max((size for leaf in jax.tree.leaves(tree) for size in entries.batch_sizes(leaf)), default=1)
 
 
 def _step(filt, state, inp, skip_prediction):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfilt.linalg.scalarize import Interpreter, NoScalarForm, assemble, entries
+from jaxfilt.linalg.entries import NoScalarForm, assemble, entries, is_known, shaped
+from jaxfilt.linalg.scalarize import Interpreter
 
 PyTree = Any
 
@@ -50,41 +51,28 @@ def scan(
         where = None if known_zeros is None else np.frombuffer(known_zeros[1], bool).reshape(known_zeros[0])
         const.append(entries(leaf, where))
 
-    closed = jax.make_jaxpr(init)(params, first)
+    closed, spec = jax.make_jaxpr(init, return_shape=True)(params, first)
     start = Interpreter(MOST)
     state = start.run_closed(closed, [*const, *(entries(x) for x in jax.tree.leaves(first))])
     _refuse(start.opaque)
     state_avals = [v.aval for v in closed.jaxpr.outvars]
-    state_tree = jax.tree.structure(jax.eval_shape(init, params, first))
-    spec = jax.tree.unflatten(state_tree, [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in state_avals])
-    closed = jax.make_jaxpr(step)(params, spec, first)
-    _, out_spec = jax.eval_shape(step, params, spec, first)
+    spec = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), spec)
+    closed, (_, out_spec) = jax.make_jaxpr(step, return_shape=True)(params, spec, first)
     out_tree = jax.tree.structure(out_spec)
     out_avals = [v.aval for v in closed.jaxpr.outvars[len(state_avals) :]]
 
     flat = [x for entry in state for x in entry.ravel()]
     dtypes = [a.dtype for a, entry in zip(state_avals, state, strict=True) for _ in range(entry.size)]
-    rows = [leaf for leaf in jax.tree.leaves(xs)]
+    rows = jax.tree.leaves(xs)
     split = [_columns(leaf) for leaf in rows]
+    shapes = [*(a.shape for a in state_avals), *(leaf.shape[1:] for leaf in rows)]
 
     def run(classes, carry, x):
         """One step: ``(flat entries of the next state, entries of the outputs, operations that they need)``."""
         interpreter = Interpreter(MOST)
-        values = [c if isinstance(c, np.generic) else carry[c] for c in classes]
-        at, ins = 0, []
-        for entry in state:
-            array = np.empty(entry.shape, object)
-            for k, index in enumerate(np.ndindex(entry.shape)):
-                array[index] = values[at + k]
-            at += entry.size
-            ins.append(array)
-        inputs = []
-        for leaf, columns in zip(rows, x, strict=True):
-            array = np.empty(leaf.shape[1:], object)
-            for index, column in zip(np.ndindex(array.shape), columns, strict=True):
-                array[index] = column
-            inputs.append(array)
-        out = interpreter.run_closed(closed, [*const, *ins, *inputs])
+        values = [c if is_known(c) else carry[c] for c in classes]
+        given = shaped([*values, *(entry for columns in x for entry in columns)], shapes)
+        out = interpreter.run_closed(closed, [*const, *given])
         _refuse(interpreter.opaque)
         flat = [y for entry in out for y in entry.ravel()]
         return flat[: len(classes)], out[len(state) :], interpreter.needed(flat)
@@ -133,23 +121,18 @@ def _classes(flat, dtypes, before):
     numbers: dict[Any, int] = {}
     out: list[Any] = []
     for x, dtype, old in zip(flat, dtypes, before, strict=True):
-        stayed = old is None or (isinstance(old, np.generic) and isinstance(x, np.generic) and _same(old, x))
-        if isinstance(x, np.generic) and stayed:
+        if is_known(x) and (old is None or (is_known(old) and old.tobytes() == x.tobytes())):
             out.append(x)
         else:
-            was = old.tobytes() if isinstance(old, np.generic) else old
-            now = x.tobytes() if isinstance(x, np.generic) else id(x)
+            was = old.tobytes() if is_known(old) else old
+            now = x.tobytes() if is_known(x) else id(x)
             out.append(numbers.setdefault((dtype.str, was, now), len(numbers)))
     return out
-
-
-def _same(a, b):
-    return a.tobytes() == b.tobytes()
 
 
 def _carry(classes, flat, dtypes):
     carry: dict[int, Any] = {}
     for c, x, dtype in zip(classes, flat, dtypes, strict=True):
-        if not isinstance(c, np.generic) and c not in carry:
+        if not is_known(c) and c not in carry:
             carry[c] = lax.convert_element_type(x, dtype)
     return [carry[c] for c in range(len(carry))]
