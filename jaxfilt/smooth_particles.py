@@ -12,7 +12,8 @@ from jax import Array
 
 from jaxfilt import core
 from jaxfilt.core import Info, PyTree, Status, flag
-from jaxfilt.linalg import chol, scale_cov, solve_lower, sym
+from jaxfilt.filters.particle import log_density, weighted
+from jaxfilt.linalg import chol, scale_cov
 from jaxfilt.models.linear import LinearGaussian
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance
 
@@ -110,15 +111,8 @@ def _smooth(model, extra, steps, key, paths, proposals):
             index = jnp.concatenate([index, last[None]])
             particles = jnp.take_along_axis(particles, index[:, :, None], axis=1)
             weights = jnp.full((T, paths), -np.log(paths), particles.dtype)
-    mean, cov = jax.vmap(_moments)(weights, particles)
+    mean, cov = jax.vmap(weighted)(weights, particles)
     return SmoothedParticles(mean, cov, particles, weights, jnp.concatenate([status, jnp.zeros((1,), jnp.int32)]))
-
-
-def _moments(log_weights, x):
-    weights = jnp.exp(log_weights)
-    mean = weights @ x
-    apart = x - mean[None, :]
-    return mean, sym((weights[:, None] * apart).T @ apart)
 
 
 def _forward(model, particles, inp):
@@ -135,9 +129,7 @@ def _forward(model, particles, inp):
 
 def _log_density(moved, L, x):
     """log p(x | where the particle came from) but for a constant."""
-    whitened = solve_lower(L, x - moved)
-    diagonal = jnp.diagonal(L)
-    return -0.5 * jnp.sum(whitened * whitened) - jnp.sum(jnp.log(jnp.where(diagonal > 0, diagonal, 1.0)))
+    return log_density(L, x - moved)
 
 
 def _marginal(model, smoothed, x):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxfilt.core import Filter, Info, Prediction, PyTree, StepInput, aspartial, bind
-from jaxfilt.filters.common import decoupled, likelihood
+from jaxfilt.filters.common import decoupled, likelihood, stack
 from jaxfilt.filters.imm import _check_probabilities, _collapse, _log_probabilities, _spread, _weigh
 from jaxfilt.linalg import chol, solve_lower
 
@@ -78,18 +78,6 @@ def _groups(filters) -> list[list[int]]:
     return list(groups.values())
 
 
-def _stacked(filters, dtype):
-    """Filters of equal structure as one with a leading axis; Python numbers take the measurements' dtype."""
-
-    def stack(*leaves):
-        floats = jnp.issubdtype(jnp.result_type(leaves[0]), jnp.floating)
-        own = getattr(leaves[0], "dtype", None)
-        weak = own is None or getattr(leaves[0], "weak_type", False)
-        return jnp.stack([jnp.asarray(leaf, dtype if floats and weak else own) for leaf in leaves])
-
-    return jax.tree.map(stack, *filters)
-
-
 def _keys(inp, group):
     """The step's input for a group: its members differ in their random keys only."""
     if inp.key is None:
@@ -108,7 +96,7 @@ def _run(p, what, dtype, inp, states=None):
             key = None if inp.key is None else jax.random.fold_in(inp.key, group[0])
             out.append(jax.tree.map(lambda x: x[None], getattr(f, what)(*_first(rest), inp._replace(key=key))))
             continue
-        stacked = _stacked([p.filters[j] for j in group], dtype)
+        stacked = stack([p.filters[j] for j in group], dtype)
         keyed, axes = _keys(inp, group)
         call = jax.vmap(lambda f, *a: getattr(f, what)(*a), (0, *(0 for _ in rest), axes))
         out.append(call(stacked, *rest, keyed))
@@ -157,7 +145,7 @@ def _all_moments(p, state, dtype):
             found = p.filters[group[0]].moments(_first(s))
             moments.append(jax.tree.map(lambda x: x[None], found))
         else:
-            stacked = _stacked([p.filters[j] for j in group], dtype)
+            stacked = stack([p.filters[j] for j in group], dtype)
             moments.append(jax.vmap(lambda f, a: f.moments(a))(stacked, s))
     return _together(p, [m for m, _ in moments]), _together(p, [c for _, c in moments])
 

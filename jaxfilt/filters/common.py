@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Status, StepInput, flag
+from jaxfilt.core import PyTree, Status, StepInput, flag
 
 
 class Innovation(NamedTuple):
@@ -85,3 +86,22 @@ def check_dtype(inp: StepInput, reference: Array) -> None:
     """Raises a TypeError if the measurement's float dtype is not the model's."""
     if inp.y.dtype != reference.dtype:
         raise TypeError(f"ys: is {inp.y.dtype}, but the filter's model is {reference.dtype}; convert one of them")
+
+
+def step_key(inp: StepInput, number: int) -> Array:
+    """Random key ``number`` of a step, or a ValueError at trace time if it has none."""
+    if inp.key is None:
+        raise ValueError("key: a particle filter draws random numbers; give jf.filter a key")
+    return jax.random.fold_in(inp.key, number)
+
+
+def stack(trees: Sequence[PyTree], dtype: Any) -> PyTree:
+    """Filters or models of equal structure as one with a leading axis; Python numbers in them take the dtype."""
+
+    def together(*leaves):
+        own = getattr(leaves[0], "dtype", None)
+        weak = own is None or getattr(leaves[0], "weak_type", False)
+        floats = jnp.issubdtype(jnp.result_type(leaves[0]), jnp.floating)
+        return jnp.stack([jnp.asarray(leaf, dtype if floats and weak else own) for leaf in leaves])
+
+    return jax.tree.map(together, *trees)

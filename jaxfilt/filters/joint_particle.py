@@ -12,8 +12,10 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.core import Filter, Info, Prediction, Static, Status, aspartial, bind, flag, is_concrete
-from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood
+from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood, stack, step_key
 from jaxfilt.filters.imm import _check_probabilities, _log_probabilities
+from jaxfilt.filters.particle import check_count, check_share
+from jaxfilt.filters.resampling import is_low, score_correction
 from jaxfilt.linalg import chol, scale_cov, solve_lower, sym
 from jaxfilt.models.linear import LinearGaussian
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance
@@ -133,8 +135,7 @@ def joint_particle(
     """
     models = _as_models(models)
     s, M = len(models), len(models[0])
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"count: expected a whole number of particles >= 1, got {count!r}")
+    check_count("count", count, "particles")
     if count % s:
         raise ValueError(f"count: expected a multiple of the {s} classes, got {count}")
     for name, option, known in (
@@ -147,8 +148,7 @@ def joint_particle(
         raise ValueError(f"floor: expected 0 < floor <= 1, got {floor}; a class without particles never comes back")
     if is_concrete(floor) and np.floor(float(floor) * count / s) < 1:
         raise ValueError(f"floor: {floor} of {count} particles leaves a class without any")
-    if is_concrete(threshold) and not 0 <= float(threshold) <= 1:
-        raise ValueError(f"threshold: expected a share in [0, 1], got {threshold}")
+    check_share("threshold", threshold)
     transition_shape = (s, M, M) if jnp.asarray(transition).ndim == 3 else (M, M)
     prior = (1 / s,) * s if prior is None else prior
     mode_prior = (1 / M,) * M if mode_prior is None else mode_prior
@@ -215,12 +215,6 @@ def _check_noise(models, rank):
                 raise ValueError(f"noise_rank: Q needs more than {rank} numbers")
 
 
-def _key(inp, number):
-    if inp.key is None:
-        raise ValueError("key: a particle filter draws random numbers; give jf.filter a key")
-    return jax.random.fold_in(inp.key, number)
-
-
 def _classes(counts, N):
     """The class (N,) of each place, for particles sorted by class."""
     ends = jnp.cumsum(counts)[:-1]
@@ -233,14 +227,8 @@ def _members(classes, s):
 
 def _tables(p):
     """The models' own parts (f, Q) with their leaves stacked over all classes and modes, (s * M, ...)."""
-    dtype = p.models[0][0].m0.dtype
-
-    def stack(*leaves):
-        arrays = [jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None) for x in leaves]
-        return jnp.stack(arrays)
-
     parts = [(model.f, model.Q) for row in p.models for model in row]
-    return jax.tree.map(stack, *parts)
+    return stack(parts, p.models[0][0].m0.dtype)
 
 
 def _init(p, inp):
@@ -253,18 +241,18 @@ def _init(p, inp):
     if p.start is None:
         mean = jnp.stack([row[0].m0 for row in p.models])
         factor = jnp.stack([chol(row[0].P0) for row in p.models])
-        noise = jax.random.normal(_key(inp, 0), (N, len(m0)), dtype)
+        noise = jax.random.normal(step_key(inp, 0), (N, len(m0)), dtype)
         blocks = jnp.einsum("cij,clj->cli", factor, noise.reshape(s, N // s, -1)) + mean[:, None, :]
         particles = blocks.reshape(N, -1)
     else:
-        particles = p.start(_key(inp, 0), classes, inp)
+        particles = p.start(step_key(inp, 0), classes, inp)
         if particles.shape != (N, len(m0)):
             raise ValueError(f"start: expected draws of shape {(N, len(m0))}, got {particles.shape}")
     check_measurement(inp, p.models[0][0].h(particles[0], inp.u, inp.dt).shape[0], "the model's h")
     modes = jnp.zeros((N,), jnp.int32)
     if M > 1:
         cumulated = jnp.cumsum(jnp.exp(_log_probabilities(p.mode_prior, dtype)))
-        u = jax.random.uniform(_key(inp, 1), (N,), dtype)
+        u = jax.random.uniform(step_key(inp, 1), (N,), dtype)
         modes = jnp.sum(u[None, :] >= cumulated[:-1, None], axis=0, dtype=jnp.int32)
     log_weights = jnp.full((N,), -np.log(N // s), dtype)
     means = particles.reshape(s, N // s, -1).mean(axis=1)
@@ -349,10 +337,10 @@ class _Draws(NamedTuple):
 def _draws(p, inp):
     options, m0 = p.options.value, p.models[0][0].m0
     N, rank = options.count, options.noise_rank or len(m0)
-    modes = jax.random.uniform(_key(inp, 2), (N,), m0.dtype) if options.modes > 1 else None
+    modes = jax.random.uniform(step_key(inp, 2), (N,), m0.dtype) if options.modes > 1 else None
     which = options.classes if options.scheme == "systematic" else N
-    ancestors = jax.random.uniform(_key(inp, 0), (which,), m0.dtype)
-    return _Draws(ancestors, modes, jax.random.normal(_key(inp, 1), (N, rank), m0.dtype))
+    ancestors = jax.random.uniform(step_key(inp, 0), (which,), m0.dtype)
+    return _Draws(ancestors, modes, jax.random.normal(step_key(inp, 1), (N, rank), m0.dtype))
 
 
 def _predict(p, state, inp):
@@ -362,8 +350,7 @@ def _predict(p, state, inp):
 
 def _low(p, ess, counts):
     """Whether a class's effective sample size calls for resampling."""
-    share = jnp.asarray(p.threshold, ess.dtype) * (1 - 1e-6)
-    return (ess < share * counts.astype(ess.dtype)).any()
+    return is_low(ess, p.threshold, counts.astype(ess.dtype)).any()
 
 
 def _ess(weights, members):
@@ -381,8 +368,7 @@ def _resample(p, state, u):
     counts = jnp.where(low, wanted, state.counts)
     equal = -jnp.log(wanted.astype(weights.dtype))[_classes(wanted, N)]
     if options.score_gradient:
-        chosen = state.log_weights[index]
-        equal = equal + (chosen - jax.lax.stop_gradient(chosen))  # adds 0; its slope is the score of the choice
+        equal = equal + score_correction(state.log_weights, index)
     log_weights = jnp.where(low, equal, state.log_weights)
     return state._replace(
         particles=state.particles[:, index], modes=state.modes[index], log_weights=log_weights, counts=counts
@@ -435,8 +421,7 @@ def _switch(p, classes, modes, log_weights, u):
     at = classes * M + modes
     drawn = sum((u >= cumulated[:, j][at]).astype(jnp.int32) for j in range(M - 1))
     if options.score_gradient:
-        chosen = log_pi.reshape(-1)[at * M + drawn]
-        log_weights = log_weights + (chosen - jax.lax.stop_gradient(chosen))
+        log_weights = log_weights + score_correction(log_pi.reshape(-1), at * M + drawn)
     return drawn, log_weights
 
 

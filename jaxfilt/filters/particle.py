@@ -11,8 +11,16 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, flag
-from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood
-from jaxfilt.filters.resampling import SCHEMES, ancestors, effective_sample_size, score_correction, soften, transport
+from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood, step_key
+from jaxfilt.filters.resampling import (
+    SCHEMES,
+    ancestors,
+    effective_sample_size,
+    is_low,
+    score_correction,
+    soften,
+    transport,
+)
 from jaxfilt.linalg import chol, scale_cov, solve_lower, sym
 from jaxfilt.models.linear import LinearGaussian, check_positive
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance
@@ -156,16 +164,10 @@ def check_share(name: str, share: Any) -> None:
     check_positive(f"1 - {name}", 1 - share, zero=True)
 
 
-def _key(inp, number):
-    if inp.key is None:
-        raise ValueError("key: a particle filter draws random numbers; give jf.filter a key")
-    return jax.random.fold_in(inp.key, number)
-
-
 def _init(p, inp):
     N, m0 = p.options.value.count, p.model.m0
     n = m0.shape[0]
-    noise = jax.random.normal(_key(inp, 0), (N, n), m0.dtype)
+    noise = jax.random.normal(step_key(inp, 0), (N, n), m0.dtype)
     particles = m0[None, :] + noise @ chol(p.model.P0).T
     shape = (N, n, n) if callable(p.model.Q) else (n, n)
     predicted = p.model.h(particles[0], inp.u, inp.dt)
@@ -180,14 +182,14 @@ def _equal(N, dtype):
 def _predict(p, state, inp):
     options, model = p.options.value, p.model
     N, dtype = options.count, state.particles.dtype
-    key = _key(inp, 0)
+    key = step_key(inp, 0)
     # After a missed step the weights need not sum to 1, and what they sum to belongs to the likelihood still to come.
     sum_before = jax.nn.logsumexp(state.log_weights)
     log_weights = state.log_weights - sum_before
     index = jnp.arange(N, dtype=jnp.int32)
     if options.auxiliary:
         origin, moved = state.particles, _move(p, state.particles, inp)
-        ahead, _ = _log_likelihood(p, moved, inp)
+        ahead, _ = _log_likelihood(p, moved, inp, *_residuals(p, moved, inp)[1:])
         # Looking ahead rules nobody out: what seems impossible now may be where the noise moves a particle.
         largest = jnp.where(jnp.isfinite(ahead), ahead, jnp.asarray(-np.inf, dtype)).max()
         largest = jnp.where(jnp.isfinite(largest), largest, jnp.zeros((), dtype))
@@ -199,7 +201,7 @@ def _predict(p, state, inp):
         log_weights = (log_weights - first)[index] + total - float(np.log(N))  # this is the score correction too
         origin, particles = origin[index], moved[index]
     else:
-        low = effective_sample_size(log_weights) < jnp.asarray(p.threshold, dtype) * N * (1 - 1e-6)
+        low = is_low(effective_sample_size(log_weights), p.threshold, N)
         origin, resampled = state.particles, _equal(N, dtype)
         if options.gradient == "transport":
             moved = transport(origin, log_weights, p.epsilon, options.sweeps)
@@ -233,7 +235,8 @@ def _move(p, particles, inp):
     return jax.vmap(lambda x: p.model.f(x, inp.u, inp.dt))(particles)
 
 
-def _weighted(log_weights, x):
+def weighted(log_weights: Array, x: Array) -> tuple[Array, Array]:
+    """Mean (n,) and covariance (n, n) of weighted particles x (N, n)."""
     weights = jnp.exp(log_weights)
     mean = weights @ x
     apart = x - mean[None, :]
@@ -254,10 +257,9 @@ def _residuals(p, particles, inp):
     return predicted, jax.vmap(one)(predicted), usable
 
 
-def _log_likelihood(p, particles, inp):
-    """log p(y | x) (N,) over the usable components, and the status."""
+def _log_likelihood(p, particles, inp, nu, usable):
+    """log p(y | x) (N,) over the usable components with residuals nu (N, m), and the status."""
     model = p.model
-    _, nu, usable = _residuals(p, particles, inp)
 
     def one(x, nu):
         R = scale_cov(covariance(model.R, x, inp.u, inp.dt), inp.r_scale)
@@ -273,7 +275,7 @@ def _update(p, state, inp):
     options, model = p.options.value, p.model
     N, n = state.particles.shape
     check_dtype(inp, state.particles)
-    noise = jax.random.normal(_key(inp, 1), (N, n), state.particles.dtype)
+    noise = jax.random.normal(step_key(inp, 1), (N, n), state.particles.dtype)
     prior = state.particles + jax.vmap(jnp.matmul, (_per_particle(p), 0))(state.spread, noise)
     before = state.log_weights - jax.nn.logsumexp(state.log_weights)
     if options.gradient == "full_score":
@@ -283,21 +285,23 @@ def _update(p, state, inp):
     elif options.gradient == "full_score":
         particles = prior
         correction = score_correction(
-            jax.vmap(_log_density, (_per_particle(p), 0))(state.spread, prior - state.particles)
+            jax.vmap(log_density, (_per_particle(p), 0))(state.spread, prior - state.particles)
         )
     else:
         particles, correction = prior, jnp.zeros((N,), prior.dtype)
-    log_lik, singular = _log_likelihood(p, particles, inp)
+    predicted, residuals, usable = _residuals(p, prior, inp)
+    if p.guide is not None:  # its particles are others
+        _, residuals, _ = _residuals(p, particles, inp)
+    log_lik, singular = _log_likelihood(p, particles, inp, residuals, usable)
 
-    predicted, _, usable = _residuals(p, prior, inp)
     centre = predicted[0]  # about one of them, since angles are not averaged as they are
     apart = (
         predicted - centre[None, :]
         if model.residual is None
         else jax.vmap(model.residual, (0, None))(predicted, centre)
     )
-    shift, spread_y = _weighted(before, apart)
-    R = scale_cov(covariance(model.R, _weighted(before, prior)[0], inp.u, inp.dt), inp.r_scale)
+    shift, spread_y = weighted(before, apart)
+    R = scale_cov(covariance(model.R, weighted(before, prior)[0], inp.u, inp.dt), inp.r_scale)
     S = sym(spread_y + R)
     y = jnp.where(usable, inp.y, centre + shift)
     nu = y - centre - shift if model.residual is None else model.residual(y, centre + shift)
@@ -320,8 +324,8 @@ def _update(p, state, inp):
     log_total = jnp.where(present.any(), log_total, jnp.zeros_like(log_total))
     ess = effective_sample_size(log_weights)
     status = flag(~present.any(), Status.MISSED) | flag((bad & present).any() | ~alive, Status.NONFINITE) | singular
-    status = status | flag(ess < jnp.asarray(p.threshold, ess.dtype) * N * (1 - 1e-6), Status.LOW_ESS)
-    mean, cov = _weighted(log_weights, particles)
+    status = status | flag(is_low(ess, p.threshold, N), Status.LOW_ESS)
+    mean, cov = weighted(log_weights, particles)
     extra = {"ess": ess}
     if options.keep:
         extra |= {"particles": particles, "log_weights": log_weights, "ancestors": state.ancestors}
@@ -343,16 +347,16 @@ def _guided(p, state, inp, noise):
         drawn = mean + C @ e
         # Both densities over the directions that have noise; their constants cancel.
         log_q = -0.5 * jnp.sum(jnp.where(jnp.diagonal(C) != 0, e, 0.0) ** 2) - _log_det(C)
-        ok = jnp.isfinite(drawn).all() & jnp.isfinite(_log_density(L, drawn - x) - log_q)
+        ok = jnp.isfinite(drawn).all() & jnp.isfinite(log_density(L, drawn - x) - log_q)
         drawn = stop(jnp.where(ok, drawn, x + L @ e))
-        log_p = _log_density(L, drawn - x)
+        log_p = log_density(L, drawn - x)
         return drawn, log_p - stop(jnp.where(ok, log_q, log_p))
 
     return jax.vmap(one, (0, _per_particle(p), 0))(state.particles, state.spread, noise)
 
 
-def _log_density(L, apart):
-    """Of N(0, L L') but for a constant, over the directions that have noise."""
+def log_density(L: Array, apart: Array) -> Array:
+    """Of ``apart`` (n,) in N(0, L L') but for a constant, over the directions that have noise."""
     whitened = solve_lower(L, apart)
     return -0.5 * jnp.sum(whitened * whitened) - _log_det(L)
 
@@ -365,6 +369,6 @@ def _log_det(L):
 
 def _moments(p, state):
     log_weights = state.log_weights - jax.nn.logsumexp(state.log_weights)
-    mean, cov = _weighted(log_weights, state.particles)
+    mean, cov = weighted(log_weights, state.particles)
     noise = jax.vmap(lambda w, L: w * (L @ L.T), (0, _per_particle(p)))(jnp.exp(log_weights), state.spread)
     return mean, sym(cov + noise.sum(axis=0))

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.core import Filter, Info, Prediction, PyTree, Static, Status, bind, flag
-from jaxfilt.filters.common import decoupled, likelihood
+from jaxfilt.filters.common import decoupled, likelihood, stack, step_key
 from jaxfilt.filters.imm import (
     _check_index,
     _check_probabilities,
@@ -24,7 +24,7 @@ from jaxfilt.filters.imm import (
     _union,
 )
 from jaxfilt.filters.particle import check_count, check_share
-from jaxfilt.filters.resampling import SCHEMES, _at, ancestors, effective_sample_size, score_correction
+from jaxfilt.filters.resampling import SCHEMES, _at, ancestors, effective_sample_size, is_low, score_correction
 from jaxfilt.linalg import chol, solve_lower
 from jaxfilt.models.linear import common_dtype
 
@@ -141,12 +141,6 @@ def rao_blackwellized(
     return bind(params, _init, _predict, _update, _moments)
 
 
-def _key(inp, number):
-    if inp.key is None:
-        raise ValueError("key: a particle filter draws random numbers; give jf.filter a key")
-    return jax.random.fold_in(inp.key, number)
-
-
 def _without_key(inp):
     return inp._replace(key=None)  # one that draws would give all particles the same draw
 
@@ -162,12 +156,7 @@ def _each(filters, dtype, fn, *trees):
     if len(jobs) == 1 or not alike:
         return [fn(*job) for job in jobs]
 
-    def stack(*same):
-        # Python numbers among the parameters take the filters' dtype, which stacked they would no longer do.
-        floating = jnp.issubdtype(jnp.result_type(same[0]), jnp.floating)
-        return jnp.stack([jnp.asarray(leaf, dtype if floating else None) for leaf in same])
-
-    out = jax.vmap(lambda job: fn(*job))(jax.tree.map(stack, *jobs))
+    out = jax.vmap(lambda job: fn(*job))(stack(jobs, dtype))
     return [jax.tree.map(lambda leaf, j=j: leaf[j], out) for j in range(len(jobs))]
 
 
@@ -205,7 +194,7 @@ def _mixture(log_joint, X, P):
 
 def _init(p, inp):
     N, r = p.options.value.count, len(p.filters)
-    key = _key(inp, 0)
+    key = step_key(inp, 0)
     alone = [f.init(_without_key(inp)) for f in p.filters]
     states = tuple(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (N, *jnp.shape(leaf))), s) for s in alone)
     _, X, _ = _lifted(p, states)
@@ -230,8 +219,8 @@ def _predict(p, state, inp):
     # After a missed step the weights need not sum to 1 for a gradient, and it belongs to the likelihood still to come.
     sum_before = jax.nn.logsumexp(log_weights)
     log_weights = log_weights - sum_before
-    low = effective_sample_size(log_weights) < jnp.asarray(p.threshold, dtype) * N * (1 - 1e-6)
-    index = ancestors(jax.lax.stop_gradient(log_weights), _key(inp, 0), options.scheme)
+    low = is_low(effective_sample_size(log_weights), p.threshold, N)
+    index = ancestors(jax.lax.stop_gradient(log_weights), step_key(inp, 0), options.scheme)
     index = jnp.where(low, index, jnp.arange(N, dtype=jnp.int32))
     resampled = -jnp.log(jnp.asarray(N, dtype)) + score_correction(log_weights, index)
     log_weights = jnp.where(low, resampled, log_weights) + sum_before
@@ -277,7 +266,7 @@ def _update(p, state, inp):
     prior, modes = state.log_joint, state.modes
     before = posterior = prior - jax.nn.logsumexp(prior)
     if options.proposal == "prior":
-        modes, prior = _drawn(prior, _key(inp, 1))
+        modes, prior = _drawn(prior, step_key(inp, 1))
         posterior = prior - jax.nn.logsumexp(prior)
     finite = jnp.isfinite(log_liks)
     joint = jnp.maximum(prior + jnp.where(finite, log_liks, never), never)
@@ -292,13 +281,11 @@ def _update(p, state, inp):
     _, X, P = _lifted(p, states)
     mean, cov = _mixture(posterior, X, P)
     if options.proposal == "optimal":
-        modes, after = _drawn(after, _key(inp, 1))
+        modes, after = _drawn(after, step_key(inp, 1))
     log_weights = jax.nn.logsumexp(posterior, axis=1)
     ess = effective_sample_size(log_weights)
 
-    status = flag(~alive, Status.NONFINITE) | flag(
-        ess < jnp.asarray(p.threshold, dtype) * N * (1 - 1e-6), Status.LOW_ESS
-    )
+    status = flag(~alive, Status.NONFINITE) | flag(is_low(ess, p.threshold, N), Status.LOW_ESS)
     for info in infos:
         status = status | jax.lax.reduce(info.status, jnp.int32(0), jax.lax.bitwise_or, (0,))
     c = jnp.exp(before).T.reshape(-1)

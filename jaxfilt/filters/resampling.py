@@ -19,6 +19,11 @@ def effective_sample_size(log_weights: Array) -> Array:
     return jnp.exp(-jax.nn.logsumexp(2 * log_weights))
 
 
+def is_low(ess: Array, threshold: Any, count: Any) -> Array:
+    """Whether an effective sample size is below a share ``threshold`` of ``count``, rounding apart."""
+    return ess < jnp.asarray(threshold, ess.dtype) * count * (1 - 1e-6)
+
+
 def ancestors(log_weights: Array, key: Array, scheme: str = "systematic") -> Array:
     """The indices (N,) int32 of N particles drawn by their weights, in ascending order.
 

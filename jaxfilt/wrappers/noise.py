@@ -229,8 +229,11 @@ def _check_scale(scale, bounds):
     return check_bounds("bounds", bounds)
 
 
-def _scaled(which, inp, factor):
-    """Q is scaled at the update too: a stationary filter solves for its covariance there."""
+def scaled(which: str, inp: StepInput, factor: Array) -> StepInput:
+    """The step's input with its noise ``"r"`` or ``"q"`` scaled by a factor.
+
+    Q is scaled at the update too: a stationary filter solves for its covariance there.
+    """
     if which == "r":
         return inp._replace(r_scale=multiply(inp.r_scale, factor))
     return inp._replace(q_scale=multiply(inp.q_scale, factor))
@@ -241,7 +244,7 @@ def _which(p):
 
 
 def _scaled_predict(p, s, inp):
-    inner, prediction = p.inner.predict(s.inner, _scaled(_which(p), inp, s.memory.scale))
+    inner, prediction = p.inner.predict(s.inner, scaled(_which(p), inp, s.memory.scale))
     return s._replace(inner=inner), prediction
 
 
@@ -269,7 +272,7 @@ def _sage_init(p, inp):
 
 def _sage_update(p, s, inp):
     which, (scale, count) = _which(p), s.memory
-    inner, info = p.inner.update(s.inner, _scaled(which, inp, scale))
+    inner, info = p.inner.update(s.inner, scaled(which, inp, scale))
     S, R = covariances(info, "sage_husa")
     used = usable(inp, info)
     zero = jnp.zeros((), R.dtype)
@@ -302,7 +305,7 @@ def _matching_init(p, inp):
 
 def _matching_update(p, s, inp):
     (which, window), (scale, values) = p.options.value, s.memory
-    inner, info = p.inner.update(s.inner, _scaled(which, inp, scale))
+    inner, info = p.inner.update(s.inner, scaled(which, inp, scale))
     S, R = covariances(info, "covariance_matching")
     used = usable(inp, info)
     variance, predicted = jnp.diagonal(R), jnp.diagonal(S - R)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Static, Status, Wrapped, flag, is_concrete, multiply, present, wrap
+from jaxfilt.core import Filter, Static, Status, Wrapped, flag, is_concrete, present, wrap
 from jaxfilt.models.linear import check_positive
 from jaxfilt.wrappers.common import check_count, covariances
-from jaxfilt.wrappers.noise import check_rate, usable
+from jaxfilt.wrappers.noise import check_rate, scaled, usable
 
 
 class _Residual(NamedTuple):
@@ -93,18 +93,14 @@ def _residual_init(p, inp):
     return Wrapped(p.inner.init(inp), jnp.ones(inp.y.shape, inp.y.dtype))
 
 
-def _by_r(inp, scale):
-    return inp._replace(r_scale=multiply(inp.r_scale, scale))
-
-
 def _residual_predict(p, s, inp):
-    inner, prediction = p.inner.predict(s.inner, _by_r(inp, s.memory))
+    inner, prediction = p.inner.predict(s.inner, scaled("r", inp, s.memory))
     return s._replace(inner=inner), prediction
 
 
 def _residual_update(p, s, inp):
     scale = s.memory
-    inp_r = _by_r(inp, scale)
+    inp_r = scaled("r", inp, scale)
     inner, info = p.inner.update(s.inner, inp_r)
     _, after = p.inner.update(inner, inp_r)  # dry: what the updated state expects, and how surely
     S, R = covariances(after, "residual_r")
@@ -123,18 +119,14 @@ def _nis_init(p, inp):
     return Wrapped(p.inner.init(inp), _Window(jnp.ones((), inp.y.dtype), empty, empty))
 
 
-def _by_q(inp, scale):
-    return inp._replace(q_scale=multiply(inp.q_scale, scale))
-
-
 def _nis_predict(p, s, inp):
-    inner, prediction = p.inner.predict(s.inner, _by_q(inp, s.memory.scale))
+    inner, prediction = p.inner.predict(s.inner, scaled("q", inp, s.memory.scale))
     return s._replace(inner=inner), prediction
 
 
 def _nis_update(p, s, inp):
     memory = s.memory
-    inner, info = p.inner.update(s.inner, _by_q(inp, memory.scale))  # stationary filters solve for P here
+    inner, info = p.inner.update(s.inner, scaled("q", inp, memory.scale))  # stationary filters solve for P here
     if info.nis is None:
         raise ValueError("filt: nis_q needs a filter that reports nis")
     used = usable(inp, info).any()

@@ -361,20 +361,21 @@ def test_difficult_gaps(name, make, dtype):
     assert all(leaf.dtype in (dtype, np.int32) for leaf in jax.tree.leaves(out))
     assert (np.linalg.eigvalsh(np.asarray(out.cov, float))[:, 0] >= -1e-5).all()
     start = int(np.argmax(mask)) if mask.any() else 41
+    rtol = 8 * np.finfo(dtype).eps  # the last bits differ with how a machine contracts products and sums
     if name != "coast_inflated":
-        np.testing.assert_array_equal(out.mean[:start], coast_mean[:start])
-        np.testing.assert_array_equal(out.cov[:start], coast_cov[:start])
+        np.testing.assert_allclose(out.mean[:start], coast_mean[:start], rtol=rtol)
+        np.testing.assert_allclose(out.cov[:start], coast_cov[:start], rtol=rtol)
     assert (out.log_lik[~mask[:, 0]] == 0).all()
     assert not has(out.status[:start], jf.Status.PSEUDO).any()
     if name == "blend" and make in (_all_missing, _single_sample, _three_samples, _long_gap):
         # Too few backtests before the first gap: all weight on the filter, and no inflation.
         stop = 38 if make is _long_gap else 12
         np.testing.assert_array_equal(out.extra["weights"][:stop, 0], 1.0)
-        np.testing.assert_array_equal(out.cov[:stop], coast_cov[:stop])
+        np.testing.assert_allclose(out.cov[:stop], coast_cov[:stop], rtol=rtol)
     if name == "polynomial_fit" and make is _single_sample:
         np.testing.assert_array_equal(out.extra["measurement"][3:], out.extra["measurement"][2:3].repeat(38, 0))
     if name == "sinusoid_fit" and make is _single_sample:
-        np.testing.assert_array_equal(out.mean, coast_mean)
+        np.testing.assert_allclose(out.mean, coast_mean, rtol=rtol)
 
 
 @jax.jit
