@@ -9,6 +9,8 @@ from jaxfilt import models as models
 from jaxfilt import simulate as simulate
 from jaxfilt import sincos as sincos
 from jaxfilt import tune as tune
+from jaxfilt.batching import batch as batch
+from jaxfilt.batching import use_cores as use_cores
 from jaxfilt.core import Filter as Filter
 from jaxfilt.core import Info as Info
 from jaxfilt.core import Prediction as Prediction
@@ -21,10 +23,13 @@ from jaxfilt.core import everything as everything
 from jaxfilt.core import filter as filter
 from jaxfilt.core import inputs as inputs
 from jaxfilt.core import intervals as intervals
+from jaxfilt.core import log_lik as log_lik
 from jaxfilt.core import mask_nan as mask_nan
+from jaxfilt.core import packed as packed
 from jaxfilt.core import scan as scan
 from jaxfilt.core import step as step
 from jaxfilt.core import summary as summary
+from jaxfilt.core import unpack as unpack
 from jaxfilt.core import wrap as wrap
 from jaxfilt.ellipse import EllipseFit as EllipseFit
 from jaxfilt.ellipse import fit_ellipse as fit_ellipse

@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.linalg import entries, scalar_scan
+from jaxfilt.linalg import entries, scalar_scan, structure
 
 PyTree = Any
 _FEW = 8  # runs below which matrices are as fast as scalars
@@ -193,6 +193,33 @@ def everything(state: PyTree, info: Info) -> Info:
     return info
 
 
+def log_lik(state: PyTree, info: Info) -> Array | None:
+    """``outputs`` that are the log-likelihood alone."""
+    del state
+    return info.log_lik
+
+
+def packed(state: PyTree, info: Info) -> tuple[Array, Array]:
+    """``outputs`` for large batches: the mean (n,) and the covariance's lower triangle (n (n + 1) / 2,) row by row.
+
+    :func:`unpack` makes it a matrix again.
+    """
+    del state
+    if info.cov is None:
+        raise ValueError("outputs: the filter reports no covariance that could be packed")
+    return info.mean, info.cov[np.tril_indices(info.cov.shape[0])]
+
+
+def unpack(triangle: Array) -> Array:
+    """Symmetric matrices (..., n, n) from their lower triangles (..., n (n + 1) / 2)."""
+    n = int(np.sqrt(2 * triangle.shape[-1]))
+    if n * (n + 1) // 2 != triangle.shape[-1]:
+        raise ValueError(f"triangle: expected n (n + 1) / 2 entries, got {triangle.shape[-1]}")
+    index = np.zeros((n, n), int)
+    index[np.tril_indices(n)] = np.arange(triangle.shape[-1])
+    return triangle[..., np.maximum(index, index.T)]
+
+
 def step(filt: Filter, state: PyTree, inp: StepInput) -> tuple[PyTree, Info]:
     """One predict-update step: ``(state, inp) -> (state, info)``, with the prediction filled into ``info``."""
     return _step(filt, state, inp, None)
@@ -204,6 +231,7 @@ def scan(
     inputs: StepInput,
     *,
     outputs: Callable[[PyTree, Info], PyTree] = summary,
+    keep: str = "stack",
     first_update_only: bool = False,
 ) -> tuple[PyTree, PyTree]:
     """Runs a filter over stacked inputs from a given state and returns the final state too (streaming, chunks).
@@ -212,13 +240,14 @@ def scan(
         filt: the filter.
         state: from ``filt.init(inp)`` or from an earlier ``scan``.
         inputs: as made by :func:`inputs`; every leaf has a leading T. Keys, if needed, are one per step.
-        outputs: ``(state, info) -> pytree``, stacked over time. Give it a name: a lambda made anew retraces.
+        outputs: ``(state, info) -> pytree``. Give it a name: a lambda made anew retraces.
+        keep: as in :func:`filter`.
         first_update_only: takes ``state`` as the prior on the first sample (no prediction before it).
 
     Returns:
-        The state after the last step, and the stacked outputs.
+        The state after the last step, and the outputs.
     """
-    return _scan(filt, state, inputs, outputs, first_update_only)
+    return _scan(filt, state, inputs, outputs, keep, first_update_only)
 
 
 def filter(
@@ -232,6 +261,7 @@ def filter(
     q_scale: Any = None,
     r_scale: Any = None,
     outputs: Callable[[PyTree, Info], PyTree] = summary,
+    keep: str = "stack",
     first_update_only: bool = False,
     form: str = "auto",
 ) -> Any:
@@ -249,16 +279,19 @@ def filter(
         key: random key, for filters that draw. Under ``vmap`` over ``ys`` give each run its own.
         q_scale: factor on Q, scalar, (T,) or (T, n).
         r_scale: factor on R, scalar, (T,) or (T, m).
-        outputs: ``(state, info) -> pytree`` inside the scan; :func:`summary` or :func:`everything`, or your own.
+        outputs: ``(state, info) -> pytree`` inside the scan: :func:`summary`, :func:`everything`, :func:`log_lik`,
+            :func:`packed`, or your own. What it does not use is not computed.
+        keep: of the outputs over time, ``"stack"`` all, their ``"sum"`` (of a status the union of the bits), or the
+            ``"last"``: a likelihood or a final state then costs no history.
         first_update_only: takes the model's m0, P0 as the prior on the first sample.
         form: ``"dense"`` computes with matrices; ``"scalar"`` with their entries one by one, which for small systems
             in large batches is many times faster on CPUs (:mod:`jaxfilt.linalg.scalarize`). ``"auto"``: scalar under a
-            ``vmap`` over 8 or more runs, if the step is small enough and has a scalar form. A matrix entry that is 0
-            counts as 0 for good if its value can be seen here (build the filter outside ``jit``): for independent axes
-            this is where most of the speed comes from.
+            ``vmap`` over 8 or more runs, if the step is small enough and has a scalar form. Matrix entries that are 0
+            or equal cost nothing if that can be seen: by value where the filter is built outside ``jit``, and of what
+            the motion models build inside; :func:`jaxfilt.batch` sees it of the filters and models it is given.
 
     Returns:
-        The stacked outputs; with :func:`summary` an :class:`Info` with leading T: ``mean (T, n)``, ``cov (T, n, n)``,
+        The outputs, stacked; with :func:`summary` an :class:`Info` with leading T: ``mean (T, n)``, ``cov (T, n, n)``,
         ``innovation (T, m)``, ``innovation_cov (T, m, m)``, ``nis (T,)``, ``log_lik (T,)``, ``status (T,)``.
 
     Raises:
@@ -271,8 +304,10 @@ def filter(
     if form not in ("auto", "dense", "scalar"):
         raise ValueError(f'form: expected "auto", "dense" or "scalar", got {form!r}')
     scalar = form == "scalar" or (form == "auto" and _runs((filt, stacked)) >= _FEW)
-    zeros = entries.zeros(filt) if scalar else None
-    return _filter(filt, stacked, key, outputs, first_update_only, form, zeros)
+    if keep not in ("stack", "sum", "last"):
+        raise ValueError(f'keep: expected "stack", "sum" or "last", got {keep!r}')
+    labels = structure.of(filt) if scalar else None
+    return _filter(filt, stacked, key, outputs, keep, first_update_only, form, labels)
 
 
 def mask_nan(ys: Any) -> tuple[Array, Array]:
@@ -345,14 +380,14 @@ def inputs(
     return StepInput(ys, mask, dt, jax.tree.map(jnp.asarray, u), keys, q_scale, r_scale)
 
 
-@partial(jax.jit, static_argnames=("outputs", "first_update_only", "form", "zeros"))
-def _filter(filt, stacked, key, outputs, first_update_only, form, zeros):
-    if zeros is not None and key is None:
+@partial(jax.jit, static_argnames=("outputs", "keep", "first_update_only", "form", "labels"))
+def _filter(filt, stacked, key, outputs, keep, first_update_only, form, labels):
+    if labels is not None and key is None:
         step = partial(_step_of, outputs=outputs)
         xs = stacked, _is_first(stacked, first_update_only)
         try:
             limit = scalar_scan.MOST if form == "scalar" else scalar_scan.WORTHWHILE
-            return scalar_scan.scan(_checked_init, step, filt, xs, zeros, limit=limit)
+            return scalar_scan.scan(_checked_init, step, filt, xs, labels, keep=keep, limit=limit)
         except entries.NoScalarForm as reason:
             if form == "scalar":
                 raise ValueError(f'form: "scalar" is not possible here: {reason}') from None
@@ -362,7 +397,7 @@ def _filter(filt, stacked, key, outputs, first_update_only, form, zeros):
     if key is not None:
         first = first._replace(key=jax.random.fold_in(key, 0))
     state = _checked_init(filt, (first, None))
-    return _scan(filt, state, stacked, outputs, first_update_only)[1]
+    return _scan(filt, state, stacked, outputs, keep, first_update_only)[1]
 
 
 def _checked_init(filt, x):
@@ -374,10 +409,10 @@ def _checked_init(filt, x):
     return state
 
 
-@partial(jax.jit, static_argnames=("outputs", "first_update_only"))
-def _scan(filt, state, stacked, outputs, first_update_only):
+@partial(jax.jit, static_argnames=("outputs", "keep", "first_update_only"))
+def _scan(filt, state, stacked, outputs, keep, first_update_only):
     body = partial(_step_of, filt, outputs=outputs)
-    return jax.lax.scan(body, state, (stacked, _is_first(stacked, first_update_only)))
+    return scalar_scan.collect(body, state, (stacked, _is_first(stacked, first_update_only)), keep)
 
 
 def _step_of(filt, state, x, outputs):

@@ -16,17 +16,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
 from jax.tree_util import Partial
 
 from jaxfilt import core, metrics
+from jaxfilt.batching import in_parts
 from jaxfilt.core import Filter, PyTree, Static, Status, aspartial
+from jaxfilt.linalg import structure
 from jaxfilt.metrics import Estimate
 from jaxfilt.models.linear import LinearGaussian
 from jaxfilt.simulate import simulate
 
-# More runs at once cost memory and save nothing: from 256 to 16384 the processor time per run is the same.
+# More runs in one call cost memory and save nothing: from 256 to 16384 the processor time per run is the same.
 _LARGEST_CHUNK = 4096
+_AT_ONCE = 512  # of which so many are computed side by side: what a step works on then stays in the cache
 
 
 class Draw(NamedTuple):
@@ -169,9 +171,9 @@ def monte_carlo(
         raise ValueError("filters: expected at least one")
     tqdm = _import_tqdm() if progress else None
     devices = tuple(jax.local_devices() if devices is None else devices)
-    static = Static((scenario.first_update_only, outputs))
 
     started = time.perf_counter()
+    static = Static((scenario.first_update_only, outputs, structure.of(filters)))
     job = (aspartial(scenario.simulate), _checked_inputs(scenario, key), filters, aspartial(score), key)
     bytes_per_run = _check_and_size(job, static)
     if chunk is None:
@@ -204,18 +206,15 @@ def monte_carlo(
 
 @partial(jax.jit, static_argnames=("static", "devices"))
 def _run_chunk(job, indices, static, devices):
-    batch = jax.vmap(partial(_run, static=static, results=_scored), (None, 0))
-    if len(devices) == 1:
-        return batch(job, indices)
-    everywhere, split = PartitionSpec(), PartitionSpec("runs")
-    mesh = Mesh(np.array(devices), ("runs",))
-    return jax.shard_map(batch, mesh=mesh, in_specs=(everywhere, split), out_specs=split, check_vma=False)(job, indices)
+    run = partial(_run, static=static, results=_scored)
+    return in_parts(run, (job,), indices, len(indices), _AT_ONCE, devices)
 
 
 def _run(job, index, static, results):
     """One run: draws the data and filters them with each filter."""
     simulate_run, (mask, dt, u), filters, score, key = job
-    first_update_only, outputs = static.value
+    first_update_only, outputs, labels = static.value
+    filters = structure.noted(filters, labels)
     key = jax.random.fold_in(key, index)
     draw = Draw(*simulate_run(jax.random.fold_in(key, 0)))
     options = {

@@ -165,3 +165,31 @@ def test_a_non_finite_estimate_is_never_silent():
     bad = ~np.isfinite(np.asarray(out.mean)).all(axis=1) | ~np.isfinite(np.asarray(out.cov)).all(axis=(1, 2))
     assert bad.any()
     assert (((np.asarray(out.status) & int(jf.Status.NONFINITE)) != 0)[bad]).all()
+
+
+def _status_and_mean(state, info):
+    return info.mean, info.status, info.log_lik
+
+
+@pytest.mark.parametrize("form", ["dense", "scalar"])
+def test_sum_and_last_of_the_outputs(form):
+    """Without a history; in a sum the bits of the status are united."""
+    mask = np.array([True, True, False, True, True])
+    means, status, log_lik = jf.filter(KALMAN, YS, mask=mask, form=form, outputs=_status_and_mean)
+    total = jf.filter(KALMAN, YS, mask=mask, form=form, outputs=_status_and_mean, keep="sum")
+    last = jf.filter(KALMAN, YS, mask=mask, form=form, outputs=_status_and_mean, keep="last")
+    np.testing.assert_allclose(total[0], means.sum(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(total[2], log_lik.sum(), rtol=1e-13)
+    assert int(total[1]) == int(jf.Status.MISSED)
+    np.testing.assert_array_equal(last[0], means[-1])
+    assert int(last[1]) == int(status[-1])
+
+
+def test_unpack_needs_a_triangle():
+    assert jf.unpack(jnp.arange(6.0)).tolist() == [[0.0, 1.0, 3.0], [1.0, 2.0, 4.0], [3.0, 4.0, 5.0]]
+    with pytest.raises(ValueError, match="triangle: expected n"):
+        jf.unpack(jnp.zeros(5))
+    with pytest.raises(ValueError, match="outputs: the filter reports no covariance"):
+        jf.filter(jf.alpha_beta(0.5, 0.3, dt=1.0), YS, outputs=jf.packed)
+    with pytest.raises(ValueError, match="keep: expected"):
+        jf.filter(KALMAN, YS, keep="all")

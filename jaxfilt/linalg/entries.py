@@ -40,8 +40,8 @@ def known(x: Any) -> Entries:
     return line(list(x.ravel())).reshape(x.shape)
 
 
-def entries(x: Any, zeros: np.ndarray | None = None) -> Entries:
-    """Entries of an array; those where ``zeros`` is true are known to be 0. NumPy arrays are known altogether."""
+def entries(x: Any, labels: np.ndarray | None = None) -> Entries:
+    """Entries of an array; 0 or the same where its ``labels`` say so. NumPy arrays are known altogether."""
     if isinstance(x, Entries) and x.dtype == object:
         return x
     if isinstance(x, np.ndarray | np.generic):
@@ -52,24 +52,13 @@ def entries(x: Any, zeros: np.ndarray | None = None) -> Entries:
     if x.size > LARGEST:
         raise NoScalarForm(f"an array of shape {x.shape}")
     out = np.empty(x.shape, object)
-    for index in np.ndindex(x.shape):
-        out[index] = np.zeros((), x.dtype)[()] if zeros is not None and zeros[index] else x[index]
+    same = {0: np.zeros((), x.dtype)[()]}
+    for number, index in enumerate(np.ndindex(x.shape)):
+        label = -1 - number if labels is None else int(labels[index])
+        if label not in same:
+            same[label] = x[index]
+        out[index] = same[label]
     return out
-
-
-def zeros(tree: Any) -> tuple[tuple[tuple[int, ...], bytes] | None, ...]:
-    """For each leaf shape and bytes of where it is 0; None where nothing is, or where no value can be seen.
-
-    Only of matrices: vectors and numbers are parameters, and a parameter that becomes 0 should not compile anew.
-    Under ``vmap`` an entry is 0 if it is in all runs.
-    """
-    seen: dict[int, Any] = {}
-    out = []
-    for leaf in jax.tree.leaves(tree):
-        if id(leaf) not in seen:
-            seen[id(leaf)] = _zeros(leaf) if hasattr(leaf, "dtype") else None
-        out.append(seen[id(leaf)])
-    return tuple(out)
 
 
 def batch_sizes(leaf: Any) -> list[int]:
@@ -82,19 +71,6 @@ def batch_sizes(leaf: Any) -> list[int]:
             sizes.append(jnp.shape(inner)[axis])
         leaf = inner
     return sizes
-
-
-def _zeros(leaf: Any):
-    batched = []
-    while isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim"):
-        axis, leaf = getattr(leaf, "batch_dim"), getattr(leaf, "val")  # noqa: B009
-        batched += [] if axis is None else [axis]
-    if isinstance(leaf, jax.core.Tracer) or not jnp.issubdtype(leaf.dtype, jnp.floating):
-        return None
-    where = np.asarray(leaf) == 0
-    for axis in batched[::-1]:
-        where = where.all(axis=axis)
-    return (where.shape, where.tobytes()) if where.ndim >= 2 and where.any() else None
 
 
 def assemble(x: Entries, aval: Any) -> Any:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxfilt.linalg import structure
 from jaxfilt.linalg.entries import NoScalarForm, assemble, entries, is_known, shaped
 from jaxfilt.linalg.scalarize import Interpreter
 
@@ -24,11 +25,12 @@ def scan(
     step: Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]],
     params: PyTree,
     xs: PyTree,
-    zeros: tuple[tuple[tuple[int, ...], bytes] | None, ...],
+    labels: tuple[structure.Labels | None, ...],
     *,
+    keep: str,
     limit: int,
 ) -> PyTree:
-    """The stacked outputs of ``step`` over the leading axis of ``xs``, from ``init(params, first x)``.
+    """The outputs of ``step`` over the leading axis of ``xs``, from ``init(params, first x)``; see :func:`collect`.
 
     Only what varies is carried: entries of the state that stay equal to each other (the two triangles of a covariance)
     are carried once, those that keep a known value (zeros) not at all. Which these are is found by assuming all that
@@ -39,7 +41,8 @@ def scan(
         step: ``(params, state, x) -> (state, outputs)``.
         params: pytree of arrays.
         xs: pytree with leading T.
-        zeros: for each leaf of ``params`` None, or shape and bytes of a bool array: where it is known to be 0.
+        labels: for each leaf of ``params`` what is known of its entries, or None.
+        keep: "stack", "sum" or "last".
         limit: largest number of scalar operations in a step, those that the outputs do not need apart.
 
     Raises:
@@ -47,9 +50,8 @@ def scan(
     """
     first = jax.tree.map(lambda leaf: leaf[0], xs)
     const = []
-    for leaf, known_zeros in zip(jax.tree.leaves(params), zeros, strict=True):
-        where = None if known_zeros is None else np.frombuffer(known_zeros[1], bool).reshape(known_zeros[0])
-        const.append(entries(leaf, where))
+    for leaf, known in zip(jax.tree.leaves(params), labels, strict=True):
+        const.append(entries(leaf, None if known is None else structure.unpack(known)))
 
     closed, spec = jax.make_jaxpr(init, return_shape=True)(params, first)
     start = Interpreter(MOST)
@@ -100,8 +102,30 @@ def scan(
 
     # Checkpointed: the reverse pass keeps the carry only and computes one step again.
     body = jax.checkpoint(body, prevent_cse=False)
-    _, outs = lax.scan(body, _carry(classes, flat, dtypes), split)
+    _, outs = collect(body, _carry(classes, flat, dtypes), split, keep)
     return jax.tree.unflatten(out_tree, outs)
+
+
+def collect(body: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTree, xs: PyTree, keep: str) -> PyTree:
+    """``lax.scan`` that stacks the outputs, or returns without a history their sum or the last.
+
+    In a sum the bits of integers (status words) are united, as are booleans.
+    """
+    if keep == "stack":
+        return lax.scan(body, carry, xs)
+    _, spec = jax.eval_shape(body, carry, jax.tree.map(lambda leaf: leaf[0], xs))
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), spec)
+
+    def both(state, x):
+        carry, kept = state
+        carry, out = body(carry, x)
+        return (carry, out if keep == "last" else jax.tree.map(_add, kept, out)), None
+
+    return lax.scan(both, (carry, empty), xs)[0]
+
+
+def _add(a, b):
+    return a + b if jnp.issubdtype(a.dtype, jnp.inexact) else a | b
 
 
 def _columns(leaf):

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.core import PyTree, aspartial, is_concrete
+from jaxfilt.linalg.structure import array, diagonal, repeat
 
 Matrix = Array | Callable[[PyTree, Array | None], Array]
 
@@ -65,7 +66,7 @@ def linear_gaussian(
     dtype = common_dtype({name: x for name, x in given.items() if not callable(x)})
     a: dict[str, Any] = {}
     for name, x in given.items():
-        a[name] = aspartial(x) if callable(x) else None if x is None else jnp.asarray(x, dtype)
+        a[name] = aspartial(x) if callable(x) else None if x is None else array(x, dtype)
     if a["m0"].ndim != 1 or a["m0"].size == 0:
         raise ValueError(f"m0: expected shape (n,) with n >= 1, got {a['m0'].shape}")
     n = a["m0"].shape[0]
@@ -98,7 +99,7 @@ def measurement_covariance(r: Array, d: int) -> Array:
     """
     if r.shape not in ((), (d,), (d, d)):
         raise ValueError(f"r: expected a scalar, shape ({d},) or ({d}, {d}), got {r.shape}")
-    return r if r.ndim == 2 else jnp.diag(jnp.broadcast_to(r, (d,)))
+    return r if r.ndim == 2 else diagonal(repeat(r, d))
 
 
 def common_dtype(arrays: dict[str, Any]) -> np.dtype:

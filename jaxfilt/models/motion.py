@@ -15,6 +15,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import Static
+from jaxfilt.linalg.structure import array, repeat
 from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian, measurement_covariance
 
 # The direction g of one step's noise for noise="piecewise", as powers dt^p / p!: by how many derivatives
@@ -79,16 +80,16 @@ def _motion_model(order, dt, q, r, m0, P0, noise):
     check_positive("dt", dt)
     check_positive("q", q, zero=True)
     dtype = common_dtype({"dt": dt, "q": q, "r": r, "m0": m0, "P0": P0})
-    m0 = jnp.asarray(m0, dtype)
+    m0 = array(m0, dtype)
     if m0.ndim != 1 or m0.size == 0 or m0.size % order:
         raise ValueError(f"m0: expected shape ({order} d,) for d axes, got {m0.shape}")
     d = m0.size // order
-    q, r = jnp.asarray(q, dtype), jnp.asarray(r, dtype)
+    q, r = array(q, dtype), array(r, dtype)
     if q.shape not in ((), (d,)):
         raise ValueError(f"q: expected a scalar or shape ({d},), got {q.shape}")
-    params = _Motion(jnp.asarray(dt, dtype), jnp.broadcast_to(q, (d,)), Static(order), Static(noise))
+    params = _Motion(array(dt, dtype), repeat(q, d), Static(order), Static(noise))
     R = measurement_covariance(r, d)
-    H = jnp.asarray(np.eye(d, order * d), dtype)
+    H = np.eye(d, order * d).astype(dtype)
     return linear_gaussian(Partial(_transition, params), H, Partial(_process_noise, params), R, m0, P0)
 
 

@@ -11,6 +11,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import PyTree, aspartial
+from jaxfilt.linalg.structure import array
 from jaxfilt.models.linear import LinearGaussian, check_covariance, check_finite, check_shape, common_dtype, value
 
 Function = Callable[[Array, PyTree, Array | None], Array]
@@ -72,7 +73,7 @@ def nonlinear(
     """
     given = {"Q": Q, "R": R, "m0": m0, "P0": P0}
     dtype = common_dtype({name: x for name, x in given.items() if not callable(x)})
-    a: dict[str, Any] = {name: aspartial(x) if callable(x) else jnp.asarray(x, dtype) for name, x in given.items()}
+    a: dict[str, Any] = {name: aspartial(x) if callable(x) else array(x, dtype) for name, x in given.items()}
     if a["m0"].ndim != 1 or a["m0"].size == 0:
         raise ValueError(f"m0: expected shape (n,) with n >= 1, got {a['m0'].shape}")
     check_finite("m0", a["m0"])
@@ -103,7 +104,7 @@ def with_sensor(motion: LinearGaussian | Nonlinear, sensor: Sensor) -> Nonlinear
         motion = as_nonlinear(motion)
     R, residual = sensor.R, _optional(sensor.residual)
     if not callable(R):
-        R = jnp.asarray(R, common_dtype({"R": R, "m0": motion.m0}))
+        R = array(R, common_dtype({"R": R, "m0": motion.m0}))
         check_shape("R", R, (R.shape[0] if R.ndim else None,) * 2)
         check_covariance("R", R)
     return motion._replace(

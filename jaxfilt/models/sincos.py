@@ -9,6 +9,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import is_concrete
+from jaxfilt.linalg.structure import array
 from jaxfilt.models.linear import check_positive, common_dtype, measurement_covariance
 from jaxfilt.models.nonlinear import Nonlinear, nonlinear
 from jaxfilt.sincos import Parameters, check_parameters, signals
@@ -54,20 +55,20 @@ def sine_cosine(
     check_positive("dt", dt)
     check_positive("q", q, zero=True)
     check_parameters(p)
-    m0 = jnp.asarray(m0, dtype)
+    m0 = array(m0, dtype)
     if m0.shape not in ((2,), (8,)):
         raise ValueError(f"m0: expected shape (2,) or (8,), got {m0.shape}")
     own = m0.shape == (8,)
     if drift is not None and not own:
         raise ValueError("drift: expected None with 2 states, which have no parameters")
-    rate = jnp.zeros((), dtype) if drift is None else jnp.asarray(drift, dtype)
+    rate = jnp.zeros((), dtype) if drift is None else array(drift, dtype)
     check_positive("drift", rate, zero=True)
     if rate.shape not in ((), (6,)):
         raise ValueError(f"drift: expected a scalar or shape (6,), got {rate.shape}")
-    r = jnp.asarray(r, dtype)
+    r = array(r, dtype)
     if r.ndim < 2 or is_concrete(r):
         check_positive("r", r if r.ndim < 2 else jnp.diagonal(r))
-    motion = _Motion(dt, jnp.asarray(q, dtype), jnp.broadcast_to(rate, (6 if own else 0,)))
+    motion = _Motion(dt, array(q, dtype), jnp.broadcast_to(rate, (6 if own else 0,)))
     h = Partial(_own if own else _given, Parameters(*(jnp.asarray(x, dtype) for x in p)))
     return nonlinear(
         Partial(_transition, motion), h, Partial(_noise, motion), measurement_covariance(r, 2), m0, P0,

@@ -10,6 +10,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import is_concrete
+from jaxfilt.linalg.structure import array, repeat
 from jaxfilt.models.discretise import van_loan
 from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian, measurement_covariance
 
@@ -47,16 +48,16 @@ def singer(*, dt: Any, tau: Any, variance: Any, r: Any, m0: Any, P0: Any) -> Lin
     check_positive("tau", tau)
     check_positive("variance", variance, zero=True)
     dtype = common_dtype({"dt": dt, "tau": tau, "variance": variance, "r": r, "m0": m0, "P0": P0})
-    m0 = jnp.asarray(m0, dtype)
+    m0 = array(m0, dtype)
     if m0.ndim != 1 or m0.size == 0 or m0.size % 3:
         raise ValueError(f"m0: expected shape (3 d,) for d axes, got {m0.shape}")
     d = m0.size // 3
-    variance, r = jnp.asarray(variance, dtype), jnp.asarray(r, dtype)
+    variance, r = array(variance, dtype), array(r, dtype)
     if variance.shape not in ((), (d,)):
         raise ValueError(f"variance: expected a scalar or shape ({d},), got {variance.shape}")
-    params = _Singer(jnp.asarray(dt, dtype), jnp.asarray(tau, dtype), jnp.broadcast_to(variance, (d,)))
+    params = _Singer(array(dt, dtype), array(tau, dtype), repeat(variance, d))
     R = measurement_covariance(r, d)
-    H = jnp.asarray(np.eye(d, 3 * d), dtype)
+    H = np.eye(d, 3 * d).astype(dtype)
     return linear_gaussian(Partial(_transition, params), H, Partial(_process_noise, params), R, m0, P0)
 
 

@@ -11,6 +11,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import is_concrete
+from jaxfilt.linalg.structure import array
 from jaxfilt.models.linear import (
     LinearGaussian,
     check_finite,
@@ -80,7 +81,7 @@ def known_turn(*, dt: Any, omega: Any, q: Any, r: Any, m0: Any, P0: Any) -> Line
     check_finite("omega", omega)
     if is_concrete((omega, dt)) and abs(angle := float(omega) * float(dt)) > np.pi:
         warnings.warn(f"omega: a turn of {angle:.3g} rad per interval is aliased", stacklevel=2)
-    H = jnp.asarray(np.eye(2, 4), R.dtype)
+    H = np.eye(2, 4).astype(R.dtype)
     return linear_gaussian(Partial(_known_transition, p), H, Partial(_velocity_noise, p), R, m0, P0)
 
 
@@ -109,14 +110,14 @@ def _check(dt, q, r, m0, P0, n, omega=None, q_omega=None):
     check_positive("q", q, zero=True)
     given = {"dt": dt, "q": q, "r": r, "m0": m0, "P0": P0, "omega": omega, "q_omega": q_omega}
     dtype = common_dtype({name: x for name, x in given.items() if x is not None})
-    m0 = jnp.asarray(m0, dtype)
+    m0 = array(m0, dtype)
     check_shape("m0", m0, (n,))
-    r = jnp.asarray(r, dtype)
+    r = array(r, dtype)
     R = measurement_covariance(r, 2)
     scalars: dict[str, Any] = {"dt": dt, "omega": omega, "q": q, "q_omega": q_omega}
     for name, x in scalars.items():
         if x is not None:
-            scalars[name] = jnp.asarray(x, dtype)
+            scalars[name] = array(x, dtype)
             check_shape(name, scalars[name], ())
     p = _Turn(**scalars)
     return p, m0, R

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.core import aspartial
+from jaxfilt.linalg import structure
 from jaxfilt.tune import params as spaces
 from jaxfilt.tune.result import Front, TuneResult, make_result, rounds
 
@@ -108,8 +110,9 @@ def _evolve(method, losses, space, data, key, weights, *, population, generation
     sample_key, seed_key = jax.random.split(key)
     z0 = jnp.clip(spaces.to_vector(space), low, high)
     first = jnp.concatenate([z0[None, :], spaces.sample(space, sample_key, population - 1)])
-    evaluate = _evaluate.lower(losses, space, data, first).compile()
-    objectives = jax.eval_shape(_evaluate, losses, space, data, first).shape[1]
+    labels = structure.of(losses)
+    evaluate = _evaluate.lower(losses, space, data, first, labels).compile()
+    objectives = evaluate.out_info.shape[1]
     weights = np.ones(objectives) if weights is None else np.asarray(weights, np.float64)
     if weights.shape != (objectives,):
         raise ValueError(f"weights: expected shape ({objectives},), got {weights.shape}")
@@ -154,9 +157,10 @@ def _evolve(method, losses, space, data, key, weights, *, population, generation
     return (jnp.asarray(best[0], first.dtype), best[1]), front, rows, compile_time
 
 
-@jax.jit
-def _evaluate(losses, space, data, z):
+@partial(jax.jit, static_argnames="labels")
+def _evaluate(losses, space, data, z, labels):
     """Losses (population, k) of z (population, d)."""
+    losses = structure.noted(losses, labels)
     return jax.vmap(lambda member: losses(spaces.constrain(space, member), data))(z)
 
 

@@ -13,6 +13,7 @@ import optax
 from jax import Array
 
 from jaxfilt.core import aspartial
+from jaxfilt.linalg import structure
 from jaxfilt.tune import params as spaces
 from jaxfilt.tune.result import TuneResult, make_result, rounds
 
@@ -79,7 +80,8 @@ def gradient(
     z0 = spaces.to_vector(space)
     others = z0[None, :] + spread * (spaces.sample(space, key, starts - 1) - z0[None, :])
     search = _begin(jnp.concatenate([z0[None, :], others]), optimizer)
-    advance = _advance.lower(loss, space, data, search, jnp.int32(0), optimizer).compile()
+    labels = structure.of(loss)
+    advance = _advance.lower(loss, space, data, search, jnp.int32(0), optimizer, labels).compile()
     bars = rounds(-(-steps // block), "gradient", progress)
     compile_time = time.perf_counter() - begun
 
@@ -104,9 +106,10 @@ def _begin(z, optimizer):
     return _Search(z, jax.vmap(optimizer.init)(z), z, best_loss)
 
 
-@partial(jax.jit, static_argnames="optimizer")
-def _advance(loss, space, data, search, count, optimizer):
+@partial(jax.jit, static_argnames=("optimizer", "labels"))
+def _advance(loss, space, data, search, count, optimizer, labels):
     """``count`` steps of all starts. The count is traced, so that a shorter last block is not compiled again."""
+    loss = structure.noted(loss, labels)
     low, high = spaces.bounds(space)
 
     def value(z):
