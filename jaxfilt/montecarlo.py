@@ -7,6 +7,7 @@ number of runs or on the devices. Nothing but the scores leaves the compiled chu
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -155,7 +156,9 @@ def monte_carlo(
             last chunk is computed in full and cut, so that there is one compilation.
         outputs: as in :func:`jaxfilt.filter`. What the score does not use is not computed, hence the default.
         memory_limit: bytes for one chunk's working set per device, for ``chunk=None``.
-        devices: JAX devices; the chunk is split over these; None = all local devices of the default backend.
+        devices: JAX devices of this process; the chunk is split over these; None = all local ones of the default
+            backend. After ``jax.distributed.initialize`` every process calls this function with the same arguments, the
+            chunks are shared out, and every process gets all scores.
         progress: shows a progress bar (needs tqdm).
 
     Returns:
@@ -190,17 +193,20 @@ def monte_carlo(
     indices = np.arange(chunk, dtype=np.uint32)
     compile_seconds = time.perf_counter() - started
 
+    # Chunk by chunk in turn to the processes; all compute equally many, so that their results can be gathered.
     started = time.perf_counter()
+    stride = chunk * jax.process_count()
     parts: list[Any] = []
-    pending: tuple[Any, int] = (None, 0)
+    pending = None
     with tqdm(total=runs, unit="run", unit_scale=True) if tqdm else contextlib.nullcontext() as bar:
-        for first in range(0, runs, chunk):
+        for first in range(chunk * jax.process_index(), stride * math.ceil(runs / stride), stride):
             result = compiled(job, indices + np.uint32(first))
-            if first:  # one chunk is in flight while the one before it is fetched
-                parts.append(_fetch(*pending, bar))
-            pending = result, min(chunk, runs - first)
-        parts.append(_fetch(*pending, bar))
-    scores, status = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+            if pending is not None:  # one chunk is in flight while the one before it is fetched
+                parts.append(_fetch(pending, bar, min(stride, runs)))
+            pending = result
+        parts.append(_fetch(pending, bar, runs - stride * len(parts)))
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    scores, status = jax.tree.map(partial(_in_order, runs=runs), _of_all_processes(stacked))
     return MonteCarloResult(scores, status, runs, chunk, compile_seconds, time.perf_counter() - started)
 
 
@@ -282,11 +288,25 @@ def _working_memory(compiled):
     return 0 if analysis is None else analysis.temp_size_in_bytes
 
 
-def _fetch(result, count, bar):
-    part = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], result)
+def _fetch(result, bar, count):
+    part = jax.tree.map(np.asarray, result)
     if bar is not None:
         bar.update(count)
     return part
+
+
+def _of_all_processes(stacked):
+    """(rounds, chunk, ...) of each process as (processes, rounds, chunk, ...) in all of them."""
+    if jax.process_count() == 1:
+        return jax.tree.map(lambda x: x[None], stacked)
+    from jax.experimental import multihost_utils
+
+    return multihost_utils.process_allgather(stacked)
+
+
+def _in_order(x, runs):
+    x = np.swapaxes(x, 0, 1)
+    return x.reshape(-1, *x.shape[3:])[:runs]
 
 
 def _check_count(name, x):

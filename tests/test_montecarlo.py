@@ -2,6 +2,7 @@
 
 import io
 import os
+import socket
 import subprocess
 import sys
 from functools import partial
@@ -188,6 +189,27 @@ def test_devices_share_the_chunk_and_give_the_same_numbers(hundred):
     done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "XLA_FLAGS": flags}, capture_output=True)
     assert done.returncode == 0, done.stderr.decode()
     np.testing.assert_allclose(np.load(io.BytesIO(done.stdout)), hundred.scores["matched"]["gap"], rtol=1e-12)
+
+
+def test_processes_share_the_runs_and_all_get_the_same_numbers(hundred, tmp_path):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    code = (
+        f"import sys, numpy as np, jax; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "jax.config.update('jax_enable_x64', True)\n"
+        f"jax.distributed.initialize('localhost:{port}', 2, int(sys.argv[1]), initialization_timeout=60)\n"
+        "import test_montecarlo as t; assert jax.process_count() == 2\n"
+        "np.save(sys.argv[2], t.run(100, t.KEY, chunk=16).scores['matched']['gap'])\n"
+    )
+    files = [tmp_path / "0.npy", tmp_path / "1.npy"]
+    command = [sys.executable, "-c", code]
+    both = [subprocess.Popen([*command, str(i), str(f)], stderr=subprocess.PIPE) for i, f in enumerate(files)]
+    for process in both:
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors.decode()
+    for file in files:
+        np.testing.assert_allclose(np.load(file), hundred.scores["matched"]["gap"], rtol=1e-12)
 
 
 def test_chunks_are_powers_of_two_that_fit_memory():
