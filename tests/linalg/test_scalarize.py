@@ -262,3 +262,12 @@ def test_what_is_known_costs_nothing():
     assert counted == [0, 4]
     with pytest.raises(NoScalarForm, match="more than 3"):
         jax.eval_shape(lambda x: Interpreter(3).run_closed(closed, [entries(x)] * 2)[0][0, 0], jnp.ones((2, 2)))
+
+
+def test_covariances_that_no_run_changes_are_computed_once():
+    """Same Q, R and mask in all runs: only means and likelihoods are batched, not the covariances (six: the mask may part the axes)."""
+    mask = np.array([True, True, False, True, True, True])
+    batch = jax.vmap(lambda y: jf.filter(velocity(25.0), y, mask=mask, outputs=_log_lik))
+    (scan,) = scans(jax.make_jaxpr(batch)(jnp.zeros((8, 6, 2))).jaxpr)
+    carried = scan.invars[scan.params["num_consts"] :][: scan.params["num_carry"]]
+    assert sorted(v.aval.shape for v in carried) == [()] * 6 + [(8,)] * 4
