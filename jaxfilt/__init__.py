@@ -77,6 +77,9 @@ from jaxfilt.smooth import rts as rts
 from jaxfilt.smooth import smooth as smooth
 from jaxfilt.smooth_particles import SmoothedParticles as SmoothedParticles
 from jaxfilt.smooth_particles import smooth_particles as smooth_particles
+from jaxfilt.status import FilterError as FilterError
+from jaxfilt.status import FilterWarning as FilterWarning
+from jaxfilt.status import check as check
 from jaxfilt.wrappers import FuzzyNoise as FuzzyNoise
 from jaxfilt.wrappers import blend as blend
 from jaxfilt.wrappers import coast_inflated as coast_inflated

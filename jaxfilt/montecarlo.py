@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from jax.tree_util import Partial
 
 from jaxfilt import core, metrics
 from jaxfilt.batching import in_parts
+from jaxfilt.checkpoint import Store, stored_chunk
 from jaxfilt.core import Filter, PyTree, Static, Status, aspartial
 from jaxfilt.linalg import structure
 from jaxfilt.metrics import Estimate
@@ -137,6 +139,7 @@ def monte_carlo(
     outputs: Callable[[PyTree, core.Info], PyTree] = core.everything,
     memory_limit: int = 256 * 2**20,
     devices: Sequence[Any] | None = None,
+    checkpoint: str | Path | None = None,
     progress: bool = False,
 ) -> MonteCarloResult:
     """Runs several filters on the same simulated data, many times, and scores each run.
@@ -159,13 +162,16 @@ def monte_carlo(
         devices: JAX devices of this process; the chunk is split over these; None = all local ones of the default
             backend. After ``jax.distributed.initialize`` every process calls this function with the same arguments, the
             chunks are shared out, and every process gets all scores.
+        checkpoint: a directory for the results of finished chunks. The same call then goes on where an interrupted one
+            was, also with more runs, and gives the same numbers to the bit.
         progress: shows a progress bar (needs tqdm).
 
     Returns:
         Scores as NumPy arrays by filter and name, status bits, and times.
 
     Raises:
-        ValueError: no filters, runs or chunk below 1, a score that is no dict, inputs of wrong shape.
+        ValueError: no filters, runs or chunk below 1, a score that is no dict, inputs of wrong shape, a ``checkpoint``
+            of another job.
         ImportError: ``progress`` without tqdm.
     """
     _check_count("runs", runs)
@@ -179,32 +185,38 @@ def monte_carlo(
     static = Static((scenario.first_update_only, outputs, structure.of(filters)))
     job = (aspartial(scenario.simulate), _checked_inputs(scenario, key), filters, aspartial(score), key)
     bytes_per_run = _check_and_size(job, static)
+    if chunk is None and checkpoint is not None:
+        chunk = stored_chunk(checkpoint)
     if chunk is None:
         per_device = _choose_chunk(-(-runs // len(devices)), bytes_per_run, memory_limit)
     else:
         _check_count("chunk", chunk)
         per_device = -(-chunk // len(devices))
-    compiled = _compile(job, per_device, static, devices)
+    compiled, lowered = _compile(job, per_device, static, devices)
     if chunk is None and (used := _working_memory(compiled)) > memory_limit:
         # The estimate saw data and outputs, but not what a filter with a large state needs in between.
         per_device = _choose_chunk(per_device, -(-used // per_device), memory_limit)
-        compiled = _compile(job, per_device, static, devices)
+        compiled, lowered = _compile(job, per_device, static, devices)
     chunk = per_device * len(devices)
+    store = None if checkpoint is None else Store(checkpoint, lowered.as_text(), job, chunk)
     indices = np.arange(chunk, dtype=np.uint32)
     compile_seconds = time.perf_counter() - started
 
     # Chunk by chunk in turn to the processes; all compute equally many, so that their results can be gathered.
     started = time.perf_counter()
     stride = chunk * jax.process_count()
+    tree = jax.tree.structure(lowered.out_info)
     parts: list[Any] = []
-    pending = None
+    pending: tuple[Any, int] | None = None
     with tqdm(total=runs, unit="run", unit_scale=True) if tqdm else contextlib.nullcontext() as bar:
         for first in range(chunk * jax.process_index(), stride * math.ceil(runs / stride), stride):
-            result = compiled(job, indices + np.uint32(first))
+            found = None if store is None else store.load(first, tree)
+            result = (compiled(job, indices + np.uint32(first)) if found is None else found), first
             if pending is not None:  # one chunk is in flight while the one before it is fetched
-                parts.append(_fetch(pending, bar, min(stride, runs)))
+                parts.append(_fetch(*pending, store, bar, min(stride, runs)))
             pending = result
-        parts.append(_fetch(pending, bar, runs - stride * len(parts)))
+        assert pending is not None
+        parts.append(_fetch(*pending, store, bar, runs - stride * len(parts)))
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
     scores, status = jax.tree.map(partial(_in_order, runs=runs), _of_all_processes(stacked))
     return MonteCarloResult(scores, status, runs, chunk, compile_seconds, time.perf_counter() - started)
@@ -280,7 +292,8 @@ def _choose_chunk(runs, bytes_per_run, memory_limit):
 
 def _compile(job, per_device, static, devices):
     indices = np.arange(per_device * len(devices), dtype=np.uint32)
-    return _run_chunk.lower(job, indices, static, devices).compile()
+    lowered = _run_chunk.lower(job, indices, static, devices)
+    return lowered.compile(), lowered
 
 
 def _working_memory(compiled):
@@ -288,8 +301,10 @@ def _working_memory(compiled):
     return 0 if analysis is None else analysis.temp_size_in_bytes
 
 
-def _fetch(result, bar, count):
+def _fetch(result, first, store, bar, count):
     part = jax.tree.map(np.asarray, result)
+    if store is not None and not isinstance(jax.tree.leaves(result)[0], np.ndarray):  # it does not come from there
+        store.save(first, part)
     if bar is not None:
         bar.update(count)
     return part

@@ -1,5 +1,6 @@
 """The Monte-Carlo runner: the same numbers whatever the chunk, one bad run alone, honest standard errors."""
 
+import errno
 import io
 import os
 import socket
@@ -16,6 +17,7 @@ import pytest
 from jax.tree_util import Partial
 
 import jaxfilt as jf
+from jaxfilt.checkpoint import Store
 from jaxfilt.core import Wrapped
 from jaxfilt.metrics import mse, nees
 from jaxfilt.montecarlo import _choose_chunk
@@ -210,6 +212,61 @@ def test_processes_share_the_runs_and_all_get_the_same_numbers(hundred, tmp_path
         assert process.returncode == 0, errors.decode()
     for file in files:
         np.testing.assert_allclose(np.load(file), hundred.scores["matched"]["gap"], rtol=1e-12)
+
+
+def interrupt_after(chunks, directory, monkeypatch):
+    """A job of 100 runs is interrupted when it has stored so many chunks."""
+    save = Store.save
+
+    def then_stop(self, first, result):
+        save(self, first, result)
+        if len(list(self._directory.glob("*.npz"))) == chunks:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Store, "save", then_stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(100, KEY, chunk=32, checkpoint=directory)
+    monkeypatch.setattr(Store, "save", save)
+
+
+def test_an_interrupted_job_goes_on_where_it_was(hundred, tmp_path, monkeypatch):
+    """With the same numbers to the bit; a damaged file is computed again; more runs may be asked for."""
+    interrupt_after(2, tmp_path, monkeypatch)
+    (tmp_path / "runs-000000000032.npz").write_bytes(b"PK damaged")
+    stored = []
+    save = Store.save
+    monkeypatch.setattr(Store, "save", lambda self, first, result: stored.append(first) or save(self, first, result))
+    for runs, computed in ((100, [32, 64, 96]), (100, []), (130, [128])):
+        stored.clear()
+        again = run(runs, KEY, checkpoint=tmp_path)  # the chunk is that of the stored job
+        assert again.chunk == 32
+        assert stored == computed
+        for name, scores in hundred.scores.items():
+            for score, values in scores.items():
+                np.testing.assert_array_equal(again.scores[name][score][:100], values)
+            np.testing.assert_array_equal(again.status[name][:100], hundred.status[name])
+
+
+def test_the_results_of_another_job_are_not_taken(tmp_path):
+    run(32, KEY, chunk=32, checkpoint=tmp_path)
+    for other, options in ((jax.random.key(6), {}), (KEY, {"chunk": 16})):
+        with pytest.raises(ValueError, match=r"checkpoint: .* holds another job"):
+            run(32, other, **{"chunk": 32, **options}, checkpoint=tmp_path)
+    filters = {**FILTERS, "wrong": jf.kalman(gap_model(q=11.0))}
+    with pytest.raises(ValueError, match=r"checkpoint: .* holds another job"):
+        jf.monte_carlo(gap_scenario(), filters, gap_score, 32, KEY, chunk=32, checkpoint=tmp_path)
+
+
+def test_a_full_disk_does_not_stop_a_job(hundred, tmp_path, monkeypatch):
+    def full(source, target):
+        if str(target).endswith("64.npz"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        os.rename(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.warns(UserWarning, match="checkpoint: a chunk could not be stored .*No space left"):
+        assert_same_scores(hundred, run(100, KEY, chunk=32, checkpoint=tmp_path))
+    assert sorted(f.name[-7:] for f in tmp_path.iterdir()) == ["000.npz", "032.npz", "096.npz", "ob.json"]
 
 
 def test_chunks_are_powers_of_two_that_fit_memory():

@@ -265,7 +265,7 @@ def test_what_is_known_costs_nothing():
 
 
 def test_covariances_that_no_run_changes_are_computed_once():
-    """Same Q, R and mask in all runs: only means and likelihoods are batched, not the covariances (six: the mask may part the axes)."""
+    """Same Q, R and mask in all runs: only the means are batched, not the covariances (the mask may part the axes)."""
     mask = np.array([True, True, False, True, True, True])
     batch = jax.vmap(lambda y: jf.filter(velocity(25.0), y, mask=mask, outputs=_log_lik))
     (scan,) = scans(jax.make_jaxpr(batch)(jnp.zeros((8, 6, 2))).jaxpr)
