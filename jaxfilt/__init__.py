@@ -63,6 +63,7 @@ from jaxfilt.filters import sqrt_extended as sqrt_extended
 from jaxfilt.filters import sqrt_kalman as sqrt_kalman
 from jaxfilt.filters import sqrt_mixed_hinf as sqrt_mixed_hinf
 from jaxfilt.filters import sqrt_unscented as sqrt_unscented
+from jaxfilt.filters import steady_state as steady_state
 from jaxfilt.filters import theta_max as theta_max
 from jaxfilt.filters import unscented as unscented
 from jaxfilt.models.delays import lag_inputs as lag_inputs
@@ -72,6 +73,9 @@ from jaxfilt.montecarlo import MonteCarloResult as MonteCarloResult
 from jaxfilt.montecarlo import Scenario as Scenario
 from jaxfilt.montecarlo import monte_carlo as monte_carlo
 from jaxfilt.montecarlo import scenario as scenario
+from jaxfilt.parallel import filter_parallel as filter_parallel
+from jaxfilt.parallel import rts_parallel as rts_parallel
+from jaxfilt.parallel import smooth_parallel as smooth_parallel
 from jaxfilt.smooth import Smoothed as Smoothed
 from jaxfilt.smooth import rts as rts
 from jaxfilt.smooth import smooth as smooth

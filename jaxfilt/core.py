@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
+from jaxfilt import checkpointed
 from jaxfilt.linalg import entries, scalar_scan, structure
 
 PyTree = Any
@@ -232,6 +233,7 @@ def scan(
     *,
     outputs: Callable[[PyTree, Info], PyTree] = summary,
     keep: str = "stack",
+    segment: int | None = None,
     first_update_only: bool = False,
 ) -> tuple[PyTree, PyTree]:
     """Runs a filter over stacked inputs from a given state and returns the final state too (streaming, chunks).
@@ -242,12 +244,13 @@ def scan(
         inputs: as made by :func:`inputs`; every leaf has a leading T. Keys, if needed, are one per step.
         outputs: ``(state, info) -> pytree``. Give it a name: a lambda made anew retraces.
         keep: as in :func:`filter`.
+        segment: as in :func:`filter`.
         first_update_only: takes ``state`` as the prior on the first sample (no prediction before it).
 
     Returns:
         The state after the last step, and the outputs.
     """
-    return _scan(filt, state, inputs, outputs, keep, first_update_only)
+    return _scan(filt, state, inputs, outputs, keep, segment, first_update_only)
 
 
 def filter(
@@ -262,6 +265,7 @@ def filter(
     r_scale: Any = None,
     outputs: Callable[[PyTree, Info], PyTree] = summary,
     keep: str = "stack",
+    segment: int | None = None,
     first_update_only: bool = False,
     form: str = "auto",
 ) -> Any:
@@ -283,6 +287,9 @@ def filter(
             :func:`packed`, or your own. What it does not use is not computed.
         keep: of the outputs over time, ``"stack"`` all, their ``"sum"`` (of a status the union of the bits), or the
             ``"last"``: a likelihood or a final state then costs no history.
+        segment: for gradients over long series: the reverse pass keeps the state every ``segment`` steps only and
+            computes those between again. About sqrt(T) needs the least memory (T = 1e5: 3 in place of 126 MB, for 1.3
+            times the time).
         first_update_only: takes the model's m0, P0 as the prior on the first sample.
         form: ``"dense"`` computes with matrices; ``"scalar"`` with their entries one by one, which for small systems
             in large batches is many times faster on CPUs (:mod:`jaxfilt.linalg.scalarize`). ``"auto"``: scalar under a
@@ -307,7 +314,9 @@ def filter(
     if keep not in ("stack", "sum", "last"):
         raise ValueError(f'keep: expected "stack", "sum" or "last", got {keep!r}')
     labels = structure.of(filt) if scalar else None
-    return _filter(filt, stacked, key, outputs, keep, first_update_only, form, labels)
+    if segment is not None:
+        segment = checkpointed.check_segment(segment, stacked.y.shape[0])
+    return _filter(filt, stacked, key, outputs, keep, segment, first_update_only, form, labels)
 
 
 def mask_nan(ys: Any) -> tuple[Array, Array]:
@@ -380,14 +389,14 @@ def inputs(
     return StepInput(ys, mask, dt, jax.tree.map(jnp.asarray, u), keys, q_scale, r_scale)
 
 
-@partial(jax.jit, static_argnames=("outputs", "keep", "first_update_only", "form", "labels"))
-def _filter(filt, stacked, key, outputs, keep, first_update_only, form, labels):
+@partial(jax.jit, static_argnames=("outputs", "keep", "segment", "first_update_only", "form", "labels"))
+def _filter(filt, stacked, key, outputs, keep, segment, first_update_only, form, labels):
     if labels is not None and key is None:
         step = partial(_step_of, outputs=outputs)
         xs = stacked, _is_first(stacked, first_update_only)
         try:
             limit = scalar_scan.MOST if form == "scalar" else scalar_scan.WORTHWHILE
-            return scalar_scan.scan(_checked_init, step, filt, xs, labels, keep=keep, limit=limit)
+            return scalar_scan.scan(_checked_init, step, filt, xs, labels, keep=keep, limit=limit, segment=segment)
         except entries.NoScalarForm as reason:
             if form == "scalar":
                 raise ValueError(f'form: "scalar" is not possible here: {reason}') from None
@@ -397,7 +406,7 @@ def _filter(filt, stacked, key, outputs, keep, first_update_only, form, labels):
     if key is not None:
         first = first._replace(key=jax.random.fold_in(key, 0))
     state = _checked_init(filt, (first, None))
-    return _scan(filt, state, stacked, outputs, keep, first_update_only)[1]
+    return _scan(filt, state, stacked, outputs, keep, segment, first_update_only)[1]
 
 
 def _checked_init(filt, x):
@@ -409,10 +418,10 @@ def _checked_init(filt, x):
     return state
 
 
-@partial(jax.jit, static_argnames=("outputs", "keep", "first_update_only"))
-def _scan(filt, state, stacked, outputs, keep, first_update_only):
+@partial(jax.jit, static_argnames=("outputs", "keep", "segment", "first_update_only"))
+def _scan(filt, state, stacked, outputs, keep, segment, first_update_only):
     body = partial(_step_of, filt, outputs=outputs)
-    return scalar_scan.collect(body, state, (stacked, _is_first(stacked, first_update_only)), keep)
+    return scalar_scan.collect(body, state, (stacked, _is_first(stacked, first_update_only)), keep, segment)
 
 
 def _step_of(filt, state, x, outputs):

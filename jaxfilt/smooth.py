@@ -31,12 +31,17 @@ def rts(out: Info) -> Smoothed:
 
     Source: Rauch, Tung and Striebel 1965.
     """
+    check_smoothable(out)
+    return _rts(out.mean, out.cov, out.prediction)
+
+
+def check_smoothable(out: Info) -> None:
+    """Raises a ValueError unless ``out`` has the predictions that smoothing needs."""
     prediction = out.prediction
     if prediction is None:
         raise ValueError("out: has no prediction; filter with outputs=jf.everything")
     if out.cov is None or prediction.cov is None or prediction.cross is None:
         raise ValueError("out: the filter reports no covariance or no cross-covariance, so it cannot be smoothed")
-    return _rts(out.mean, out.cov, prediction)
 
 
 @jax.jit

@@ -22,12 +22,14 @@ from tests.examples import (
     particle,
     rao_blackwellized,
     sincos,
+    steady,
 )
 
 REGISTRY: dict[str, Example] = {
     **adaptive.EXAMPLES, **attitude.EXAMPLES, **bearing.EXAMPLES, **delayed.EXAMPLES, **hinf.EXAMPLES,
     **linear.EXAMPLES, **nonlinear.EXAMPLES, **imm.EXAMPLES, **interval.EXAMPLES, **joint.EXAMPLES, **noise.EXAMPLES,
     **particle.EXAMPLES, **rao_blackwellized.EXAMPLES, **sincos.EXAMPLES,
+    **steady.EXAMPLES,
 }  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from jaxfilt.filters.kalman import kalman as kalman
 from jaxfilt.filters.particle import particle as particle
 from jaxfilt.filters.rao_blackwellized import rao_blackwellized as rao_blackwellized
 from jaxfilt.filters.sqrt_kalman import sqrt_kalman as sqrt_kalman
+from jaxfilt.filters.steady_state import steady_state as steady_state
 from jaxfilt.filters.unscented import cubature as cubature
 from jaxfilt.filters.unscented import sqrt_cubature as sqrt_cubature
 from jaxfilt.filters.unscented import sqrt_unscented as sqrt_unscented

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,14 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxfilt.linalg import structure
+from jaxfilt import checkpointed
+from jaxfilt.linalg import segments, structure
 from jaxfilt.linalg.entries import NoScalarForm, assemble, entries, is_known, shaped
 from jaxfilt.linalg.scalarize import Interpreter
 
 PyTree = Any
 
 # Scalar operations in a step up to which the scalar form runs faster than the dense one, and the most that are traced.
-WORTHWHILE, MOST = 1500, 20_000
+WORTHWHILE, MOST = 2000, 20_000
 
 
 def scan(
@@ -29,6 +31,7 @@ def scan(
     *,
     keep: str,
     limit: int,
+    segment: int | None = None,
 ) -> PyTree:
     """The outputs of ``step`` over the leading axis of ``xs``, from ``init(params, first x)``; see :func:`collect`.
 
@@ -43,6 +46,7 @@ def scan(
         xs: pytree with leading T.
         labels: for each leaf of ``params`` what is known of its entries, or None.
         keep: "stack", "sum" or "last".
+        segment: as in :func:`collect`.
         limit: largest number of scalar operations in a step, those that the outputs do not need apart.
 
     Raises:
@@ -100,19 +104,30 @@ def scan(
         after, outs, _ = run(classes, carry, x)
         return _carry(classes, after, dtypes), [assemble(y, a) for y, a in zip(outs, out_avals, strict=True)]
 
+    carry = _carry(classes, flat, dtypes)
+    if after[2] > segments.MANY:
+        body = segments.segmented(body, carry, jax.tree.map(lambda column: column[0], split))
     # Checkpointed: the reverse pass keeps the carry only and computes one step again.
     body = jax.checkpoint(body, prevent_cse=False)
-    _, outs = collect(body, _carry(classes, flat, dtypes), split, keep)
+    _, outs = collect(body, carry, split, keep, segment)
     return jax.tree.unflatten(out_tree, outs)
 
 
-def collect(body: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTree, xs: PyTree, keep: str) -> PyTree:
+def collect(
+    body: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]],
+    carry: PyTree,
+    xs: PyTree,
+    keep: str,
+    segment: int | None = None,
+) -> PyTree:
     """``lax.scan`` that stacks the outputs, or returns without a history their sum or the last.
 
-    In a sum the bits of integers (status words) are united, as are booleans.
+    In a sum the bits of integers (status words) are united, as are booleans. With a ``segment`` it is checkpointed
+    every so many steps.
     """
+    run = lax.scan if segment is None else partial(checkpointed.scan, segment=segment)
     if keep == "stack":
-        return lax.scan(body, carry, xs)
+        return run(body, carry, xs)
     _, spec = jax.eval_shape(body, carry, jax.tree.map(lambda leaf: leaf[0], xs))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), spec)
 
@@ -121,7 +136,7 @@ def collect(body: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTr
         carry, out = body(carry, x)
         return (carry, out if keep == "last" else jax.tree.map(_add, kept, out)), None
 
-    return lax.scan(both, (carry, empty), xs)[0]
+    return run(both, (carry, empty), xs)[0]
 
 
 def _add(a, b):

@@ -22,6 +22,7 @@ import jax
 import numpy as np
 from jax import lax
 
+from jaxfilt.linalg import elementary
 from jaxfilt.linalg.entries import NoScalarForm, assemble, entries, is_known, known
 from jaxfilt.linalg.scalar_ops import COMMUTATIVE, ELEMENTWISE, FOLDS, PLAIN, evaluate
 from jaxfilt.linalg.scalar_rules import RULES
@@ -118,7 +119,7 @@ class Interpreter:
         keys = [(x.dtype.str, x.tobytes()) if is_known(x) else id(x) for x in xs]
         if name in COMMUTATIVE:
             keys.sort(key=repr)
-        plain = PLAIN.get(name)
+        plain = PLAIN.get(name) or elementary.instead_of(name, dtype)
         key = (name, None if plain else repr(sorted(params.items(), key=lambda item: item[0])), *keys)
         if key not in self._known:
             self.count += 1
