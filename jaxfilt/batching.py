@@ -24,7 +24,7 @@ def batch(
     fn: Callable[..., PyTree],
     in_axes: Any = 0,
     *,
-    chunk: int = 512,
+    chunk: int = 256,
     devices: Sequence[Any] | None = None,
 ) -> Callable[..., PyTree]:
     """``jax.jit(jax.vmap(fn, in_axes))``, split over the devices and computed in chunks; several times as fast.
@@ -39,7 +39,7 @@ def batch(
     Args:
         fn: a function of one run, module-level or a ``jax.tree_util.Partial`` of such (another one compiles anew).
         in_axes: as in ``jax.vmap``: the axis of each argument that counts the runs, None for what they share.
-        chunk: most runs that a device computes at once. 512 suits likelihoods and histories, 128 gradients.
+        chunk: most runs that a device computes at once. 128 suits gradients, 64 long histories of large states.
         devices: JAX devices; None = all local devices of the default backend.
 
     Returns:

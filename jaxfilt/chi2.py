@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from jaxfilt import core
+
 
 def chi2_quantile(probability: float, dof: float) -> float:
     """The x with ``P(chi2_dof <= x) = probability``, in float64 whatever JAX's precision.
@@ -16,6 +18,7 @@ def chi2_quantile(probability: float, dof: float) -> float:
     Raises:
         ValueError: a probability outside (0, 1 - 1e-9], or dof <= 0.
     """
+    probability, dof = core.number("probability", probability), core.number("dof", dof)
     if not 0 < probability <= 1 - 1e-9:
         raise ValueError(f"probability: expected a value in (0, 1 - 1e-9], got {probability}")
     if not (dof > 0 and math.isfinite(dof)):

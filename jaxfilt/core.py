@@ -94,8 +94,13 @@ class Static:
     value: Any
 
 
-def aspartial(fn: Callable) -> Partial:
-    """Makes a function a valid pytree; a ``Partial`` stays as it is, so that its bound values remain leaves."""
+def aspartial(fn: Callable, name: str = "fn") -> Partial:
+    """Makes a function a valid pytree; a ``Partial`` stays as it is, so that its bound values remain leaves.
+
+    Raises:
+        TypeError: for what is no function; it names the argument.
+    """
+    check_callable(name, fn)
     return fn if isinstance(fn, Partial) else Partial(fn)
 
 
@@ -135,6 +140,7 @@ def wrap(
         update: ``(params, Wrapped, inp) -> (Wrapped, Info)``.
     """
     inner: Filter = params.inner
+    check_filter(inner)
     return bind(
         params,
         init or _wrapped_init,
@@ -213,6 +219,8 @@ def packed(state: PyTree, info: Info) -> tuple[Array, Array]:
 
 def unpack(triangle: Array) -> Array:
     """Symmetric matrices (..., n, n) from their lower triangles (..., n (n + 1) / 2)."""
+    if not hasattr(triangle, "shape"):
+        triangle = jnp.asarray(numbers("triangle", triangle))
     n = int(np.sqrt(2 * triangle.shape[-1]))
     if n * (n + 1) // 2 != triangle.shape[-1]:
         raise ValueError(f"triangle: expected n (n + 1) / 2 entries, got {triangle.shape[-1]}")
@@ -223,6 +231,9 @@ def unpack(triangle: Array) -> Array:
 
 def step(filt: Filter, state: PyTree, inp: StepInput) -> tuple[PyTree, Info]:
     """One predict-update step: ``(state, inp) -> (state, info)``, with the prediction filled into ``info``."""
+    check_filter(filt)
+    if not isinstance(inp, StepInput):
+        raise TypeError(f"inp: expected a StepInput, got {type(inp).__name__}")
     return _step(filt, state, inp, None)
 
 
@@ -250,6 +261,10 @@ def scan(
     Returns:
         The state after the last step, and the outputs.
     """
+    check_filter(filt)
+    if not isinstance(inputs, StepInput):
+        raise TypeError(f"inputs: expected a stacked StepInput, got {type(inputs).__name__}")
+    segment = _check_options(outputs, keep, segment, inputs)
     return _scan(filt, state, inputs, outputs, keep, segment, first_update_only)
 
 
@@ -307,20 +322,20 @@ def filter(
         ValueError: ``form="scalar"`` for a step that has none; says why.
         TypeError: integer arrays, or another float dtype than the model's.
     """
+    check_filter(filt)
     stacked = inputs(ys, mask=mask, dt=dt, u=u, key=key, q_scale=q_scale, r_scale=r_scale)
     if form not in ("auto", "dense", "scalar"):
         raise ValueError(f'form: expected "auto", "dense" or "scalar", got {form!r}')
     scalar = form == "scalar" or (form == "auto" and _runs((filt, stacked)) >= _FEW)
-    if keep not in ("stack", "sum", "last"):
-        raise ValueError(f'keep: expected "stack", "sum" or "last", got {keep!r}')
+    segment = _check_options(outputs, keep, segment, stacked)
     labels = structure.of(filt) if scalar else None
-    if segment is not None:
-        segment = checkpointed.check_segment(segment, stacked.y.shape[0])
     return _filter(filt, stacked, key, outputs, keep, segment, first_update_only, form, labels)
 
 
 def mask_nan(ys: Any) -> tuple[Array, Array]:
     """Turns NaN into masked samples: returns ``ys`` with zeros in their place, and the mask (True = present)."""
+    if is_concrete(ys):
+        numbers("ys", ys)
     ys = jnp.asarray(ys)
     mask = ~jnp.isnan(ys)
     return jnp.where(mask, ys, jnp.zeros((), ys.dtype)), mask
@@ -332,6 +347,9 @@ def intervals(times: Any, *, first: float) -> Array:
     Raises:
         ValueError: if the (concrete) time stamps do not increase.
     """
+    for name, x, shape in (("times", times, "(T,)"), ("first", first, "()")):
+        if is_concrete(x) and numbers(name, x).ndim != len(shape) // 4:
+            raise ValueError(f"{name}: expected shape {shape}, got {np.shape(x)}")
     if is_concrete(times):
         stamps = np.asarray(times, np.float64)
         increases = stamps[1:] > stamps[:-1]  # false for NaN too
@@ -356,7 +374,7 @@ def inputs(
 
     With a ``key``, step k gets ``fold_in(key, k + 1)``; ``fold_in(key, 0)`` is left for ``init``.
     """
-    _check_float("ys", ys)
+    check_float("ys", ys)
     concrete = ys
     ys = jnp.asarray(ys)
     if ys.ndim != 2:
@@ -366,7 +384,7 @@ def inputs(
         raise ValueError(f"ys: expected at least one sample of at least one component, got shape {ys.shape}")
     if mask is not None:
         if getattr(mask, "dtype", np.asarray(mask).dtype if is_concrete(mask) else None) != np.dtype(bool):
-            raise TypeError(f"mask: expected bool, got {jnp.asarray(mask).dtype}")
+            raise TypeError(f"mask: expected bool, got {getattr(mask, 'dtype', type(mask).__name__)}")
         mask = jnp.asarray(mask)
         if mask.shape not in {(T,), (T, m)}:
             raise ValueError(f"mask: expected shape ({T},) or ({T}, {m}), got {mask.shape}")
@@ -378,6 +396,8 @@ def inputs(
             k = int(np.argmin(np.asarray(dt) >= 0))
             raise ValueError(f"dt: expected finite intervals >= 0, got dt[{k}] = {float(dt[k])}")
     for leaf in jax.tree.leaves(u):
+        if not hasattr(leaf, "dtype"):
+            numbers("u", leaf)
         _check_same_dtype("u", leaf, ys.dtype)
         if jnp.shape(leaf)[:1] != (T,):
             raise ValueError(f"u: expected leaves with leading T = {T}, got shape {jnp.shape(leaf)}")
@@ -385,6 +405,8 @@ def inputs(
         q_scale = _per_step("q_scale", q_scale, T, ys.dtype, ranks=(1, 2))
     if r_scale is not None:
         r_scale = _per_step("r_scale", r_scale, T, ys.dtype, ranks=(1, 2))
+    if key is not None:
+        check_key(key)
     keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(1, T + 1))
     return StepInput(ys, mask, dt, jax.tree.map(jnp.asarray, u), keys, q_scale, r_scale)
 
@@ -435,6 +457,13 @@ def _is_first(stacked, first_update_only):
     return jnp.arange(stacked.y.shape[0]) == 0 if first_update_only else None
 
 
+def _check_options(outputs, keep, segment, stacked):
+    check_callable("outputs", outputs)
+    if keep not in ("stack", "sum", "last"):
+        raise ValueError(f'keep: expected "stack", "sum" or "last", got {keep!r}')
+    return None if segment is None else checkpointed.check_segment(segment, stacked.y.shape[0])
+
+
 def _runs(tree):
     """How many runs ``vmap`` computes at once here."""
     return max((size for leaf in jax.tree.leaves(tree) for size in entries.batch_sizes(leaf)), default=1)
@@ -466,7 +495,52 @@ def is_concrete(x: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(x))
 
 
-def _check_float(name, x):
+def check_filter(filt: Any, name: str = "filt") -> None:
+    """Raises a TypeError that names the argument if it is no filter."""
+    if not isinstance(filt, Filter):
+        raise TypeError(f"{name}: expected a filter, got {type(filt).__name__}")
+
+
+def check_callable(name: str, fn: Any) -> None:
+    """Raises a TypeError that names the argument if it is no function."""
+    if not callable(fn):
+        raise TypeError(f"{name}: expected a function, got {type(fn).__name__}")
+
+
+def check_key(key: Any, name: str = "key") -> None:
+    """Raises a TypeError that names the argument if it is no random key."""
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not (jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == np.uint32):
+        raise TypeError(f"{name}: expected a random key, got {type(key).__name__}")
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    """Raises a ValueError that names an option if it is no integer of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
+
+
+def numbers(name: str, x: Any) -> np.ndarray:
+    """A concrete ``x`` as an array of real numbers, or a TypeError that names it."""
+    try:
+        a = np.asarray(x)
+    except (TypeError, ValueError):  # a random key, a ragged list
+        a = np.asarray(None)
+    if not any(jnp.issubdtype(a.dtype, kind) for kind in (np.floating, np.integer, np.bool_)):
+        raise TypeError(f"{name}: expected real numbers, got {x!r}")
+    return a
+
+
+def number(name: str, x: Any) -> float:
+    """A concrete ``x`` as one real number, or a TypeError that names it."""
+    a = numbers(name, x)
+    if a.ndim:
+        raise TypeError(f"{name}: expected a number, got shape {a.shape}")
+    return float(a)
+
+
+def check_float(name: str, x: Any) -> None:
+    """Raises a TypeError that names ``x`` if it is no float array."""
     dtype = x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
     if not jnp.issubdtype(dtype, jnp.floating):
         raise TypeError(f"{name}: expected a float array, got {dtype}")
@@ -500,6 +574,8 @@ def _per_step(name, x, T, dtype, ranks):
         if not jnp.issubdtype(x.dtype, jnp.floating):
             raise TypeError(f"{name}: expected a float array, got {x.dtype}")
         _check_same_dtype(name, x, dtype)
+    elif is_concrete(x):
+        numbers(name, x)
     x = jnp.asarray(x, dtype)
     if x.ndim == 0:
         x = jnp.broadcast_to(x, (T,))

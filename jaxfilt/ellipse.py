@@ -11,8 +11,9 @@ import numpy as np
 from jax import Array
 from jax.scipy.linalg import solve_triangular
 
-from jaxfilt.core import Status, flag, is_concrete
-from jaxfilt.sincos import Parameters
+from jaxfilt.core import Status, check_count, check_float, flag, is_concrete
+from jaxfilt.models.linear import check_positive, check_shape
+from jaxfilt.sincos import Parameters, both_present
 
 
 class EllipseFit(NamedTuple):
@@ -54,14 +55,16 @@ def fit_ellipse(
 
     Source: Heydemann 1981; the standard deviations: White 1980.
     """
+    check_float("ys", ys)
     ys = jnp.asarray(ys)
-    if not jnp.issubdtype(ys.dtype, jnp.floating):
-        raise TypeError(f"ys: expected a float array, got {ys.dtype}")
     if ys.ndim != 2 or ys.shape[1] != 2:
         raise ValueError(f"ys: expected shape (T, 2), got {ys.shape}; batch with jax.vmap")
-    if block < 1:
-        raise ValueError(f"block: expected at least 1, got {block}")
-    here = jnp.ones(ys.shape[:1], bool) if mask is None else jnp.asarray(mask).reshape(ys.shape[0], -1).all(axis=1)
+    check_count("block", block, 1)
+    check_positive("limit", limit)
+    check_positive("least_coverage", least_coverage, zero=True)
+    check_shape("limit", limit, ())
+    check_shape("least_coverage", least_coverage, ())
+    here = both_present(ys, mask)
     if is_concrete((ys, here)):
         if not np.isfinite(np.asarray(ys)[np.asarray(here)]).all():
             raise ValueError("ys: expected finite values where no mask covers them; use jf.mask_nan")

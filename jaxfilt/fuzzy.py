@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Static, is_concrete
+from jaxfilt.core import Static, check_count, check_float, is_concrete, numbers
 from jaxfilt.models.linear import check_finite, check_positive
 
 _POINTS = 1001  # of the output's universe, over which the centroid is taken
@@ -78,8 +78,7 @@ def partition(universe: Any, sets: int = 4, logits: Any = None) -> Array:
         ValueError: universe <= 0, fewer than 2 sets, logits of another shape or (concrete) not finite.
     """
     check_positive("universe", universe)
-    if isinstance(sets, bool) or not isinstance(sets, int) or sets < 2:
-        raise ValueError(f"sets: expected an integer >= 2, got {sets!r}")
+    check_count("sets", sets, 2)
     segments = 2 * sets - 1
     universe = jnp.asarray(universe)
     if not jnp.issubdtype(universe.dtype, jnp.floating):
@@ -136,6 +135,8 @@ def stick_breaking(x: Array, centers: Array, widths: Array) -> Array:
 
 def minimum_rules(levels: int, inputs: int) -> np.ndarray:
     """The rule table (levels,) * inputs whose output level is the lowest of the inputs' sets."""
+    check_count("levels", levels, 1)
+    check_count("inputs", inputs, 1)
     return np.indices((levels,) * inputs).min(axis=0)
 
 
@@ -146,7 +147,9 @@ def check_rules(rules: Any, sets: int, inputs: int, levels: int) -> np.ndarray:
         ValueError: another shape than ``(sets,) * inputs``, or an entry outside 0..levels - 1.
         TypeError: no integers.
     """
-    rules = np.asarray(rules)
+    for name, count in (("sets", sets), ("inputs", inputs), ("levels", levels)):
+        check_count(name, count, 1)
+    rules = numbers("rules", rules)
     if not np.issubdtype(rules.dtype, np.integer):
         raise TypeError(f"rules: expected integers, got {rules.dtype}")
     if rules.shape != (sets,) * inputs:
@@ -241,13 +244,22 @@ def triangles(levels: int = 4, output_range: tuple[float, float] = (0.0, 100.0),
         output_range: ends of the output's universe. The first and the last triangle peak there and are cut by it.
         inner: peaks inside instead, at ``1 / (levels + 1), 2 / (levels + 1), ...`` of the range: nothing is cut.
     """
-    low, high = output_range
+    check_count("levels", levels, 2)
+    low, high = check_range(output_range)
     place = np.arange(levels)
     if inner:
         corners = (place[:, None] + np.arange(3)) / (levels + 1)
     else:
         corners = np.clip((place[:, None] + np.arange(-1, 2)) / (levels - 1), 0.0, 1.0)
     return low + (high - low) * corners
+
+
+def check_range(output_range: Any) -> tuple[float, float]:
+    """The ends of the output's universe, or an error that names ``output_range``."""
+    ends = numbers("output_range", output_range)
+    if ends.shape != (2,) or not (np.isfinite(ends).all() and ends[0] < ends[1]):
+        raise ValueError(f"output_range: expected finite ends low < high, got {output_range}")
+    return float(ends[0]), float(ends[1])
 
 
 def mamdani(
@@ -278,6 +290,8 @@ def mamdani(
     """
     check_positive("universe", universe)
     universe = universe if hasattr(universe, "dtype") else np.asarray(universe, float)
+    if universe.size == 0:
+        raise ValueError(f"universe: expected shape (d,) with d >= 1, got {universe.shape}")
     universe = universe.reshape(-1) if np.ndim(universe) < 2 else universe
     if universe.ndim != 1:
         raise ValueError(f"universe: expected shape (d,), got {universe.shape}")
@@ -285,23 +299,22 @@ def mamdani(
     if corners is None:
         corners = partition(universe, sets)
     else:
-        corners = corners if hasattr(corners, "dtype") else np.asarray(corners, float)
+        corners = corners if hasattr(corners, "dtype") else numbers("corners", corners).astype(float)
         if corners.ndim not in (2, 3) or corners.shape[-1] != 4 or (corners.ndim == 3 and corners.shape[0] != d):
             raise ValueError(f"corners: expected shape (L, 4) or ({d}, L, 4), got {corners.shape}")
         corners = corners if corners.ndim == 3 else jnp.broadcast_to(corners, (d, *corners.shape))
     _check_inputs(universe, corners)
-    if not (np.isfinite(output_range).all() and output_range[0] < output_range[1]):
-        raise ValueError(f"output_range: expected finite ends low < high, got {output_range}")
+    output_range = check_range(output_range)
     L = corners.shape[1]
     if outputs is None:
         outputs = triangles(L, output_range)
-    outputs = outputs if hasattr(outputs, "dtype") else np.asarray(outputs, float)
+    outputs = outputs if hasattr(outputs, "dtype") else numbers("outputs", outputs).astype(float)
     if outputs.ndim != 2 or outputs.shape[1] != 3:
         raise ValueError(f"outputs: expected shape (K, 3), got {outputs.shape}")
     _check_outputs(outputs, output_range)
     rules = minimum_rules(L, d) if rules is None else rules
     rules = check_rules(rules, L, d, outputs.shape[0])
-    return Mamdani(universe, corners, freeze_rules(rules), outputs, tuple(float(end) for end in output_range))
+    return Mamdani(universe, corners, freeze_rules(rules), outputs, output_range)
 
 
 def infer(system: Mamdani, x: Array) -> Inference:
@@ -314,6 +327,10 @@ def infer(system: Mamdani, x: Array) -> Inference:
         system: from :func:`mamdani`.
         x: (d,) inputs. Their absolute value counts, and beyond the universe its end does.
     """
+    if not isinstance(system, Mamdani):
+        raise TypeError(f"system: expected a jf.fuzzy.Mamdani, got {type(system).__name__}")
+    check_float("x", x)
+    x = jnp.asarray(x)
     universe, corners, outputs, ends = (
         jnp.asarray(part, x.dtype) for part in (system.universe, system.corners, system.outputs, system.output_range)
     )

@@ -93,7 +93,7 @@ def batch_ml(
     """
     check_count("iterations", iterations, 1)
     check_positive("damping", damping)
-    model = as_nonlinear(model) if isinstance(model, LinearGaussian) else model
+    model = as_nonlinear(model)
     dtype = model.m0.dtype
     n = model.m0.shape[0]
     starts = jnp.asarray(starts, dtype)

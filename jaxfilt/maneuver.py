@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.chi2 import chi2_quantile
-from jaxfilt.core import Info, Status
+from jaxfilt.core import Info, Status, check_count, check_float, number
 from jaxfilt.filters.common import decoupled
 from jaxfilt.linalg import chol, solve_lower, sym
 
@@ -95,7 +95,7 @@ def detector(statistic: str = "fading", *, p_false: float = 1e-3, forgetting: fl
 def static_number(name: str, value: Any) -> float:
     """The value as a Python float, or a TypeError that names it: a traced value cannot be static."""
     try:
-        return float(value)
+        return number(name, value)
     except (TypeError, ValueError, jax.errors.ConcretizationTypeError):
         raise TypeError(f"{name}: expected a plain number (it is static), got {value!r}") from None
 
@@ -181,7 +181,13 @@ def cumulative(nis: Any, mask: Any = None, *, m: int = 1) -> Cumulative:
     Returns:
         ``Cumulative(statistic, dof, p_value)``, each (..., T); p_value is 1 before the first sample.
     """
+    check_float("nis", nis)
+    check_count("m", m, 1)
     nis = jnp.asarray(nis)
+    if mask is not None and getattr(mask, "dtype", None) != np.dtype(bool):
+        raise TypeError(f"mask: expected a bool array, got {getattr(mask, 'dtype', type(mask).__name__)}")
+    if nis.ndim == 0 or (mask is not None and (np.ndim(mask) < 2 or mask.shape[-2] != nis.shape[-1])):
+        raise ValueError(f"nis, mask: expected shapes (..., T) and (..., T, m), got {nis.shape} and {np.shape(mask)}")
     counts = jnp.full(nis.shape, m) if mask is None else jnp.asarray(mask).sum(axis=-1)
     dof = jnp.broadcast_to(jnp.cumsum(counts, axis=-1), nis.shape)
     statistic = jnp.cumsum(nis, axis=-1)

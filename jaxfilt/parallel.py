@@ -27,7 +27,7 @@ from jaxfilt.filters.common import decoupled, innovate, masked_rows
 from jaxfilt.filters.kalman import init_mean, input_term, kalman
 from jaxfilt.filters.transfer import Transfer, apply, join, prior, transfer
 from jaxfilt.linalg import chol, entries, scalar_scan, scale_cov, solve_chol, structure, sym
-from jaxfilt.models.linear import LinearGaussian, value
+from jaxfilt.models.linear import LinearGaussian, check_linear, value
 from jaxfilt.smooth import Smoothed, check_smoothable
 
 
@@ -72,6 +72,8 @@ def filter_parallel(
 
     Source: Särkkä and García-Fernández 2021.
     """
+    check_linear(model)
+    core.check_callable("outputs", outputs)
     stacked = core.inputs(ys, mask=mask, dt=dt, u=u, q_scale=q_scale, r_scale=r_scale)
     block = _block(block, stacked.y.shape[0])
     return _filter(model, stacked, outputs, first_update_only, block, _associative(associative), structure.of(model))

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import is_concrete, mask_nan
-from jaxfilt.models.linear import check_positive
+from jaxfilt.core import check_count, check_float, is_concrete, mask_nan, number, numbers
+from jaxfilt.models.linear import check_finite, check_positive, check_shape
 from jaxfilt.models.sensors import wrap
 
 
@@ -107,18 +107,34 @@ def arctan(
     Raises:
         ValueError: shape, ``counts`` below 1, or a rate that passes half a cycle per sample.
     """
+    check_float("ys", ys)
     ys = jnp.asarray(ys)
     if ys.ndim != 2 or ys.shape[1] != 2:
         raise ValueError(f"ys: expected shape (T, 2), got {ys.shape}; batch with jax.vmap")
-    if counts is not None and counts < 1:
-        raise ValueError(f"counts: expected at least 1, got {counts}")
-    here = jnp.isfinite(ys)
-    if mask is not None:
-        here = here & jnp.asarray(mask).reshape(ys.shape[0], -1)
+    if counts is not None:
+        check_count("counts", counts, 1)
+    check_finite("floor", floor)
+    check_shape("floor", floor, ())
+    if parameters is not None:
+        check_parameters(parameters)
+    here = jnp.isfinite(ys) & both_present(ys, mask)[:, None]
     out, steps = _arctan(ys, here, Parameters() if parameters is None else parameters, floor, counts)
     if is_concrete((steps, out.usable)):
         _check_rate(np.asarray(steps), np.asarray(out.usable))
     return out
+
+
+def both_present(ys: Array, mask: Any) -> Array:
+    """(T,) bool: where both signals (T, 2) are present; the mask, (T,) or (T, 2) bool or None, is checked."""
+    T = ys.shape[0]
+    if mask is None:
+        return jnp.ones((T,), bool)
+    mask = mask if hasattr(mask, "dtype") else numbers("mask", mask)
+    if mask.dtype != np.dtype(bool):
+        raise TypeError(f"mask: expected bool, got {mask.dtype}")
+    if mask.shape not in {(T,), (T, 2)}:
+        raise ValueError(f"mask: expected shape ({T},) or ({T}, 2), got {mask.shape}")
+    return jnp.asarray(mask).reshape(T, -1).all(axis=1)
 
 
 @partial(jax.jit, static_argnames=("counts",))
@@ -158,6 +174,7 @@ def mask_clipped(ys: Any, low: float, high: float) -> tuple[Array, Array]:
     Raises:
         ValueError: unless ``low < high``.
     """
+    low, high = number("low", low), number("high", high)
     if not low < high:
         raise ValueError(f"low: expected low < high, got {low} and {high}")
     ys, mask = mask_nan(ys)
@@ -194,6 +211,10 @@ def calibrated(mean: Array, cov: Array, prior: Any, *, share: float = 0.1) -> Ar
         prior: (8, 8) the model's P0.
         share: as above.
     """
+    for name, x, shape in (("mean", mean, (None, 8)), ("cov", cov, (None, 8, 8)), ("prior", prior, (8, 8))):
+        check_float(name, x)
+        check_shape(name, x, shape)
+    check_positive("share", share)
     covered = jax.lax.cummax(mean[:, 0]) - jax.lax.cummin(mean[:, 0]) >= 2 * np.pi
     index = np.array([2, 3, 5, 6])
     before = jnp.diagonal(jnp.asarray(prior, cov.dtype))[index]
@@ -247,5 +268,7 @@ def smoothness_loss(
 
 
 def check_parameters(parameters: Parameters) -> None:
-    """Raises a ValueError if a concrete amplitude is not positive."""
+    """Raises a ValueError if a concrete amplitude is not positive, a TypeError for what are no parameters."""
+    if not isinstance(parameters, Parameters):
+        raise TypeError(f"parameters: expected jf.sincos.Parameters, got {type(parameters).__name__}")
     check_positive("amplitude", parameters.amplitude)

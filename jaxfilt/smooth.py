@@ -37,6 +37,8 @@ def rts(out: Info) -> Smoothed:
 
 def check_smoothable(out: Info) -> None:
     """Raises a ValueError unless ``out`` has the predictions that smoothing needs."""
+    if not isinstance(out, Info):
+        raise TypeError(f"out: expected the Info that jf.filter returns, got {type(out).__name__}")
     prediction = out.prediction
     if prediction is None:
         raise ValueError("out: has no prediction; filter with outputs=jf.everything")

@@ -80,8 +80,7 @@ def smooth_particles(
         raise ValueError("paths: without them nothing is drawn, so proposals and key have no meaning")
     if paths is not None and key is None:
         raise ValueError("key: paths are drawn; give a key")
-    if isinstance(model, LinearGaussian):
-        model = as_nonlinear(model)
+    model = as_nonlinear(model)
     steps = core.inputs(out.mean, dt=dt, u=u, q_scale=q_scale)
     found = _smooth(model, out.extra, steps, key, paths, proposals)
     if core.is_concrete(found.status) and (np.asarray(found.status) & int(Status.SINGULAR)).any():

@@ -53,6 +53,9 @@ def check(
         FilterError: one of the bits ``error`` occurred.
         TypeError: ``out`` has no status.
     """
+    for name, bits in (("error", error), ("warn", warn)):
+        if not isinstance(bits, int):
+            raise TypeError(f"{name}: expected bits of Status, got {bits!r}")
     words = getattr(out, "status", out)
     for name, word in words.items() if isinstance(words, dict) else [("", words)]:
         word = np.asarray(word)

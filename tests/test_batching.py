@@ -24,6 +24,12 @@ def loss(log_r, y):
     return jf.filter(jf.kalman(model), y, outputs=jf.log_lik, keep="sum")
 
 
+def modes(log_r, y):
+    models = [jf.models.constant_velocity(dt=1.0, q=q, r=jnp.exp(log_r), m0=np.zeros(4), P0=P0) for q in (0.1, 1.0)]
+    filt = jf.imm([jf.kalman(model) for model in models], np.array([[0.9, 0.1], [0.1, 0.9]]))
+    return jf.filter(filt, y, outputs=jf.log_lik, keep="sum")
+
+
 def history(filt, y):
     return jf.filter(filt, y, outputs=jf.packed)
 
@@ -137,6 +143,8 @@ def test_devices_give_the_same_numbers(tmp_path):
         "import test_batching as t; assert len(jax.devices()) == 2\n"
         "np.save(sys.argv[1], jf.batch(t.loss, chunk=4)(*t.data(19)))\n"
         "np.save(sys.argv[2], jf.batch(jax.grad(t.loss), chunk=4)(*t.data(19)))\n"
+        "modes = jax.make_jaxpr(lambda *a: jf.batch(t.modes)(*a))(*t.data(64))\n"
+        "assert 'dot_general' not in str(modes)\n"  # the scalar form, also where models are stacked
     )
     files = [str(tmp_path / name) for name in ("values.npy", "gradients.npy")]
     done = subprocess.run([sys.executable, "-c", code, *files], env=dict(os.environ), capture_output=True)

@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, StepInput, bind, flag, is_concrete, present
+from jaxfilt.core import Filter, Info, Prediction, Static, Status, StepInput, bind, flag, is_concrete, numbers, present
 from jaxfilt.filters.common import check_dtype, check_measurement
 from jaxfilt.filters.update import joseph_update
 from jaxfilt.linalg import rotation, scale_cov, skew, sym
@@ -131,7 +131,7 @@ def attitude(
     _check_fraction("kappa", kappa)
     check_positive("c", c, zero=True)
     trust = Partial(_lagged, c)
-    given = {"kappa": kappa, "trust": trust, "acc_var": acc_var}
+    given = {"kappa": kappa, "trust": trust, "named": {"c": c}, "acc_var": acc_var}
     return _build(6, dt, gyro_var, bias_var, bias_q, frame, gravity, prop, z0, P0, bias_limit, project_cov, **given)
 
 
@@ -178,6 +178,7 @@ def attitude_peak(
     _check_fraction("decay", decay)
     check_positive("rho", rho, zero=True)
     given = {"kappa": kappa, "trust": Partial(_held, rho, decay), "acc_var": acc_var}
+    given["named"] = {"rho": rho, "decay": decay}
     return _build(6, dt, gyro_var, bias_var, bias_q, frame, gravity, prop, z0, P0, bias_limit, project_cov, **given)
 
 
@@ -226,6 +227,7 @@ def attitude_switched(
     if width is not None:
         check_positive("width", width)
     given = {"kappa": 0.0, "trust": Partial(_switched, gravity, threshold, width, moving_var), "acc_var": acc_var}
+    given["named"] = {"threshold": threshold, "width": width, "moving_var": moving_var}
     return _build(6, dt, gyro_var, bias_var, bias_q, frame, gravity, prop, z0, P0, bias_limit, project_cov, **given)
 
 
@@ -279,7 +281,7 @@ def attitude_velocity(
 
 def _build(
     n, dt, gyro_var, bias_var, bias_q, frame, gravity, prop, z0, P0, bias_limit, project_cov,
-    *, kappa, trust, acc_var, velocity_var=None,
+    *, kappa, trust, acc_var, named=None, velocity_var=None,
 ):  # fmt: skip
     sign = check_frame(frame)
     if prop not in ("exact", "euler"):
@@ -298,7 +300,12 @@ def _build(
         dt, sign * gravity, gyro_var, acc_var, bias_var if bias_q is None else None, bias_q, kappa, trust, velocity_var,
         z0, P0, bias_limit, Static(_Options(prop == "exact", bool(project_cov))),
     )  # fmt: skip
-    common_dtype({str(i): x for i, x in enumerate(jax.tree.leaves(p)) if x is not None})
+    check_positive("bias_var", bias_var)
+    parameters = {**p._replace(trust=None, options=None)._asdict(), **(named or {})}
+    common_dtype({name: x for name, x in parameters.items() if x is not None})
+    for name, x in parameters.items():
+        if name not in ("z0", "P0") and x is not None:
+            check_shape(name, x, ())
     return bind(p, _init, _predict, _update if velocity_var is None else _update_velocity, _moments, _with_moments)
 
 
@@ -322,7 +329,7 @@ def check_start(z0: Any) -> Array | None:
 
 
 def _check_fraction(name, x):
-    if is_concrete(x) and not (np.asarray(x) >= 0).all() & (np.asarray(x) <= 1).all():
+    if is_concrete(x) and not ((a := numbers(name, x)) >= 0).all() & (a <= 1).all():
         raise ValueError(f"{name}: expected a value in [0, 1], got {x}")
 
 

@@ -58,14 +58,14 @@ def bank(
 
     Source: Magill 1965; Bar-Shalom, Li and Kirubarajan 2001, section 11.6.2.
     """
-    filters = () if isinstance(filters, Filter) else tuple(filters)
+    filters = tuple(filters) if isinstance(filters, tuple | list) and not isinstance(filters, Filter) else ()
     if not filters or not all(isinstance(f, Filter) for f in filters):
         raise TypeError("filters: expected a tuple of one or more Filters")
     s = len(filters)
     prior = (1 / s,) * s if prior is None else prior
     _check_probabilities("prior", prior, (s,))
     has_moments = all(f.moments is not None for f in filters)
-    params = _Params(filters, prior, None if score is None else aspartial(score))
+    params = _Params(filters, prior, None if score is None else aspartial(score, "score"))
     return bind(params, _init, _predict, _update, _moments if has_moments else None)
 
 

@@ -15,7 +15,7 @@ from jax import Array
 from jaxfilt.core import Filter, Info, Prediction, Status, bind, flag, present
 from jaxfilt.filters.attitude import GRAVITY, angles, check_frame, check_start, held_rate, interval, start_axis, unit
 from jaxfilt.linalg import rotation
-from jaxfilt.models.linear import check_positive, common_dtype
+from jaxfilt.models.linear import check_positive, check_shape, common_dtype
 
 
 class ComplementaryState(NamedTuple):
@@ -54,7 +54,7 @@ def complementary(*, dt: Any, tau: Any = 2.0, frame: str = "up", gravity: Any = 
         TypeError: integer arrays or mixed float dtypes.
     """
     check_positive("tau", tau)
-    return bind(_params(dt, frame, gravity, z0, (tau,)), _init, _predict, _update_complementary)
+    return bind(_params(dt, frame, gravity, z0, {"tau": tau}), _init, _predict, _update_complementary)
 
 
 def mahony(
@@ -83,7 +83,8 @@ def mahony(
     """
     check_positive("proportional", proportional)
     check_positive("integral", integral, zero=True)
-    return bind(_params(dt, frame, gravity, z0, (proportional, integral)), _init_mahony, _predict, _update_mahony)
+    gains = {"proportional": proportional, "integral": integral}
+    return bind(_params(dt, frame, gravity, z0, gains), _init_mahony, _predict, _update_mahony)
 
 
 def madgwick(*, dt: Any, beta: Any = 0.12, frame: str = "up", gravity: Any = GRAVITY, z0: Any = None) -> Filter:
@@ -102,14 +103,18 @@ def madgwick(*, dt: Any, beta: Any = 0.12, frame: str = "up", gravity: Any = GRA
     Source: Madgwick, Harrison and Vaidyanathan 2011, ICORR.
     """
     check_positive("beta", beta)
-    return bind(_params(dt, frame, gravity, z0, (beta,)), _init_madgwick, _predict_madgwick, _update_madgwick)
+    return bind(_params(dt, frame, gravity, z0, {"beta": beta}), _init_madgwick, _predict_madgwick, _update_madgwick)
 
 
 def _params(dt, frame, gravity, z0, gains):
     check_positive("dt", dt)
     check_positive("gravity", gravity)
-    p = _Params(dt, check_frame(frame) * gravity, check_start(z0), gains)
-    common_dtype({str(i): x for i, x in enumerate(jax.tree.leaves(p))})
+    p = _Params(dt, check_frame(frame) * gravity, check_start(z0), tuple(gains.values()))
+    named = {"dt": dt, "gravity": gravity, "z0": p.z0, **gains}
+    common_dtype({name: x for name, x in named.items() if x is not None})
+    for name, x in named.items():
+        if name != "z0":
+            check_shape(name, x, ())
     return p
 
 

@@ -10,12 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, aspartial, bind, flag, is_concrete
+from jaxfilt.core import (
+    Filter,
+    Info,
+    Prediction,
+    Static,
+    Status,
+    aspartial,
+    bind,
+    check_count,
+    flag,
+    is_concrete,
+    numbers,
+)
 from jaxfilt.filters.common import innovate, likelihood
 from jaxfilt.filters.kalman import init_mean, input_term
 from jaxfilt.linalg import chol, scale_cov, solve_chol, solve_lower, sym
 from jaxfilt.models.delays import check_probabilities
-from jaxfilt.models.linear import LinearGaussian, check_positive, value
+from jaxfilt.models.linear import LinearGaussian, check_linear, check_positive, common_dtype, value
 
 # The packets under way are part of the state: X = [x; Z_1; ..; Z_d], where Z_l is what will arrive in l samples as far
 # as it has been decided. With rows H_0 = [H, -I at Z_1], .., H_d = [H, 0] and theta_l = 1 if the packet is l late:
@@ -168,11 +180,11 @@ def adaptive_delayed_kalman(
 
     Source: Nikfetrat, Mahboobi Esfanjani and Azimi 2017, eqs. (22) to (38), corrected.
     """
-    if forgetting is None and window < 1:
-        raise ValueError(f"window: expected at least 1, got {window}")
-    if forgetting is not None and is_concrete(forgetting) and not 0 <= float(forgetting) < 1:
+    if forgetting is None:
+        check_count("window", window, 1)
+    elif is_concrete(forgetting) and not 0 <= float(numbers("forgetting", forgetting)) < 1:
         raise ValueError(f"forgetting: expected a value in [0, 1), got {forgetting}")
-    if len(bounds) != 2:
+    if not hasattr(bounds, "__len__") or len(bounds) != 2:
         raise ValueError(f"bounds: expected (smallest, largest), got {bounds}")
     check_positive("bounds", bounds[0])
     if is_concrete(bounds) and not bounds[0] <= bounds[1]:
@@ -189,11 +201,13 @@ def adaptive_delayed_kalman(
 def _params(model, probabilities, second_moment):
     if second_moment not in ("exact", "zero_mean", "posterior"):
         raise ValueError(f'second_moment: expected "exact", "zero_mean" or "posterior", got {second_moment!r}')
+    check_linear(model)
     if model.D is not None:
         raise ValueError("model: an input of the measurement (D) would make an empty sample differ from 0")
     if callable(probabilities):
         probabilities = aspartial(probabilities)
     else:
+        common_dtype({"probabilities": probabilities})
         probabilities = jnp.asarray(probabilities, model.m0.dtype)
         _check_shape(probabilities, None if callable(model.H) else model.H.shape[0])
         check_probabilities("probabilities", probabilities)

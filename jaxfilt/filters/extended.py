@@ -106,7 +106,7 @@ def _params(model, order, iterations, relinearize):
         raise ValueError(f"iterations: expected 1 with order=2, got {iterations}")
     if order == 2 and relinearize:
         raise ValueError("relinearize: expected False with order=2")
-    model = as_nonlinear(model) if isinstance(model, LinearGaussian) else model
+    model = as_nonlinear(model)
     return _Params(model, Static(order), Static(iterations), Static(bool(relinearize)))
 
 

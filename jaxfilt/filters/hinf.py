@@ -9,12 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, flag, is_concrete
+from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, check_count, flag, is_concrete, numbers
 from jaxfilt.filters.kalman import init_mean, measurement, propagate
 from jaxfilt.filters.kalman import input_term as _input
 from jaxfilt.filters.update import array_update, joseph_update
 from jaxfilt.linalg import chol, scale_cov, scale_factor, solve_chol, solve_lower, sym, tria
-from jaxfilt.models.linear import LinearGaussian, check_covariance, check_finite, check_shape, value
+from jaxfilt.models.linear import (
+    LinearGaussian,
+    check_covariance,
+    check_finite,
+    check_linear,
+    check_positive,
+    check_shape,
+    value,
+)
 
 _CAP = 0.99  # of the bound, where theta had to be lowered to stay below it
 _DOUBLINGS = 16
@@ -136,7 +144,9 @@ def theta_max(model: LinearGaussian, *, weight: Any = None, steps: int | None = 
         ValueError: matrices that are functions or traced, a singular R.
     """
     F, H, Q, R, P0 = (np.asarray(x, np.float64) for x in _matrices(model))
-    S = np.eye(len(F)) if weight is None else np.asarray(weight, np.float64)
+    S = np.asarray(_weight(weight, len(F), model.F.dtype), np.float64)
+    if steps is not None:
+        check_count("steps", steps, 1)
     G = H.T @ np.linalg.solve(R, H)
     root = _root(S)
 
@@ -190,14 +200,15 @@ def riccati(model: LinearGaussian, theta: Any = 0.0, *, weight: Any = None, doub
     Source: Chu, Fan, Lin and Wang 2004.
     """
     F, H, Q, R, _ = _matrices(model)
-    S = jnp.eye(F.shape[0], dtype=F.dtype) if weight is None else jnp.asarray(weight, F.dtype)
+    check_theta("theta", theta)
+    check_count("doublings", doublings, 0)
+    S = _weight(weight, F.shape[0], F.dtype)
     return _solve(F, H, Q, R, theta * theta, S, doublings)
 
 
 def check_theta(name: str, theta: Any) -> None:
     """Raises a ValueError that names ``theta`` if it is concrete and negative or not finite."""
-    if is_concrete(theta) and not (np.isfinite(np.asarray(theta)) & (np.asarray(theta) >= 0)).all():
-        raise ValueError(f"{name}: expected a finite value >= 0, got {theta}")
+    check_positive(name, theta, zero=True)
 
 
 def _make(model, theta2, weight, stationary, output, infeasible, square_root):
@@ -205,12 +216,11 @@ def _make(model, theta2, weight, stationary, output, infeasible, square_root):
         raise ValueError(f'output: expected "corrected", "posterior" or "pred", got {output!r}')
     if infeasible not in ("cap", "nan"):
         raise ValueError(f'on_infeasible: expected "cap" or "nan", got {infeasible!r}')
+    check_linear(model)
     if model.S is not None:
         raise ValueError("model: noise correlated between process and measurement (S) is not covered")
     n, dtype = model.m0.shape[0], model.m0.dtype
-    weight = jnp.eye(n, dtype=dtype) if weight is None else jnp.asarray(weight, dtype)
-    check_shape("weight", weight, (n, n))
-    check_covariance("weight", weight)
+    weight = _weight(weight, n, dtype)
     fixed = None
     if stationary:
         F, H, Q, R, _ = _matrices(model)
@@ -239,6 +249,7 @@ def _check_bound(model, theta2, weight, stationary):
 
 
 def _matrices(model):
+    check_linear(model)
     for name in ("F", "H", "Q", "R"):
         if callable(getattr(model, name)):
             raise ValueError(f"model: {name} must be a matrix for a stationary filter")
@@ -246,6 +257,17 @@ def _matrices(model):
     if is_concrete(model.R) and np.linalg.eigvalsh(np.asarray(model.R, np.float64))[0] <= 0:
         raise ValueError("R: expected a positive definite matrix for the Riccati equation")
     return model.F, model.H, model.Q, model.R, model.P0
+
+
+def _weight(weight, n, dtype):
+    if weight is None:
+        return jnp.eye(n, dtype=dtype)
+    if is_concrete(weight):
+        numbers("weight", weight)
+    weight = jnp.asarray(weight, dtype)
+    check_shape("weight", weight, (n, n))
+    check_covariance("weight", weight)
+    return weight
 
 
 def _root(S):

@@ -98,7 +98,7 @@ def imm(
     Source: Blom and Bar-Shalom 1988; Bar-Shalom, Li and Kirubarajan 2001, section 11.6; mixing with states of different
     size: Glass, Blair and Bar-Shalom 2013.
     """
-    filters = () if isinstance(filters, Filter) else tuple(filters)
+    filters = tuple(filters) if isinstance(filters, tuple | list) and not isinstance(filters, Filter) else ()
     if not filters or not all(isinstance(f, Filter) for f in filters):
         raise TypeError("filters: expected a tuple of one or more Filters")
     r = len(filters)

@@ -159,7 +159,8 @@ def joint_particle(
     options = _Options(count, s, M, resampling, score_at, noise_rank, score_gradient, keep)
     params = _Params(
         models, transition, prior, mode_prior, floor, threshold,
-        None if score is None else aspartial(score), None if start is None else aspartial(start), Static(options),
+        None if score is None else aspartial(score, "score"),
+        None if start is None else aspartial(start, "start"), Static(options),
     )  # fmt: skip
     return bind(params, _init, _predict, _update, _moments)
 
@@ -187,7 +188,9 @@ def multi_mode_particle(
 
 
 def _as_models(models) -> tuple[tuple[Nonlinear, ...], ...]:
-    rows = tuple(tuple(as_nonlinear(m) if isinstance(m, LinearGaussian) else m for m in row) for row in models)
+    if not isinstance(models, tuple | list) or not all(isinstance(row, tuple | list) for row in models):
+        raise TypeError("models: expected a sequence of models for each class")
+    rows = tuple(tuple(as_nonlinear(m, "models") for m in row) for row in models)
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
         raise ValueError("models: expected the same number of models, one or more, for each class")
     first, structure = rows[0][0], jax.tree.structure(rows[0][0])

@@ -11,7 +11,7 @@ from jaxfilt.core import Filter, Prediction, StepInput, bind
 from jaxfilt.filters.common import check_measurement, decoupled, masked_rows
 from jaxfilt.filters.update import joseph_update
 from jaxfilt.linalg import chol, mirror, scale_cov, solve_chol, sym
-from jaxfilt.models.linear import LinearGaussian, value
+from jaxfilt.models.linear import LinearGaussian, check_linear, value
 
 
 class Correlated(NamedTuple):
@@ -48,6 +48,7 @@ def kalman(model: LinearGaussian) -> Filter:
 
     Source: Kalman 1960; Bucy and Joseph 1968; Bar-Shalom, Li and Kirubarajan 2001, section 5.2.
     """
+    check_linear(model)
     return bind(model, _init, _predict, _update, _moments, _with_moments)
 
 

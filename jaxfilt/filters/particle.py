@@ -142,8 +142,7 @@ def particle(
     check_share("alpha", alpha)
     check_positive("alpha", alpha)
     check_positive("epsilon", epsilon)
-    if isinstance(model, LinearGaussian):
-        model = as_nonlinear(model)
+    model = as_nonlinear(model)
     options = _Options(count, resampling, auxiliary, gradient, sweeps, keep)
     inner = None if guide is None else guide(model)
     if inner is not None and (inner.moments is None or inner.with_moments is None):
@@ -161,7 +160,7 @@ def check_count(name: str, count: Any, of: str) -> None:
 def check_share(name: str, share: Any) -> None:
     """Raises a ValueError if ``share`` is concrete and not in [0, 1]."""
     check_positive(name, share, zero=True)
-    check_positive(f"1 - {name}", 1 - share, zero=True)
+    check_positive(f"1 - {name}", 1 - jnp.asarray(share), zero=True)
 
 
 def _init(p, inp):

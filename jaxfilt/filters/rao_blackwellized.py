@@ -113,7 +113,7 @@ def rao_blackwellized(
 
     Source: Chen and Liu 2000; Doucet, Gordon and Krishnamurthy 2001.
     """
-    filters = () if isinstance(filters, Filter) else tuple(filters)
+    filters = tuple(filters) if isinstance(filters, tuple | list) and not isinstance(filters, Filter) else ()
     if not filters or not all(isinstance(f, Filter) for f in filters):
         raise TypeError("filters: expected a tuple of one or more Filters")
     r = len(filters)

@@ -19,7 +19,7 @@ from jaxfilt.filters.kalman import (
 )
 from jaxfilt.filters.update import array_update
 from jaxfilt.linalg import chol, scale_factor, sym, tria
-from jaxfilt.models.linear import LinearGaussian
+from jaxfilt.models.linear import LinearGaussian, check_linear
 
 
 class SqrtKalmanState(NamedTuple):
@@ -52,6 +52,7 @@ def sqrt_kalman(model: LinearGaussian) -> Filter:
 
     Source: Kaminski, Bryson and Schmidt 1971; Grewal and Andrews 2001, chapter 6.
     """
+    check_linear(model)
     params = _Params(
         model,
         chol(model.P0),

@@ -23,7 +23,7 @@ from jaxfilt.filters.kalman import (
 from jaxfilt.filters.transfer import Transfer, join
 from jaxfilt.filters.update import joseph_update
 from jaxfilt.linalg import chol, solve_chol, solve_lower, sym
-from jaxfilt.models.linear import LinearGaussian
+from jaxfilt.models.linear import LinearGaussian, check_linear
 
 # Each stands for as many steps as all before it. 2^40 steps tell every decay from none.
 _DOUBLINGS = 40
@@ -81,6 +81,7 @@ def steady_state(model: LinearGaussian) -> Filter:
 
     Source: Anderson and Moore 1979, chapter 4; doubling: Chu, Fan, Lin and Wang 2004.
     """
+    check_linear(model)
     matrices = {name: _constant(name, getattr(model, name)) for name in ("F", "H", "Q", "R", "S")}
     model = model._replace(**matrices)
     steady = _steady(model.F, model.H, model.Q, model.R, model.P0, model.S)

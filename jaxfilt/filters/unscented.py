@@ -13,7 +13,7 @@ from jaxfilt.core import Filter, Prediction, Static, Status, bind, flag, is_conc
 from jaxfilt.filters.extended import init_mean
 from jaxfilt.filters.update import array_update, factor_update
 from jaxfilt.linalg import chol, mirror, scale_cov, solve_lower, sym, tria
-from jaxfilt.models.linear import LinearGaussian, common_dtype
+from jaxfilt.models.linear import LinearGaussian, check_finite, check_positive, common_dtype
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance
 
 
@@ -111,13 +111,14 @@ def sqrt_cubature(model: Nonlinear | LinearGaussian) -> Filter:
 
 
 def _params(model, alpha, beta, kappa):
-    model = as_nonlinear(model) if isinstance(model, LinearGaussian) else model
+    model = as_nonlinear(model)
     n = model.m0.shape[0]
     common_dtype({"alpha": alpha, "beta": beta, "kappa": kappa, "m0": model.m0})
     downdates = True
+    check_positive("alpha", alpha)
+    check_finite("beta", beta)
+    check_finite("kappa", kappa)
     if is_concrete((alpha, beta, kappa)):
-        if not alpha > 0:
-            raise ValueError(f"alpha: expected a value > 0, got {alpha}")
         if not n + kappa > 0:
             raise ValueError(f"kappa: expected n + kappa > 0 with n = {n}, got {kappa}")
         if alpha < 0.1 and model.m0.dtype == jnp.float32:

@@ -372,6 +372,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": _broadcast_in_dim, "reshape": _reshape, "slice": _slice, "pad": _pad, "iota": _iota,
     "split": _split, "stack": _stack, "tile": _tile, "cumsum": _cumsum, "dot_general": _dot_general, "scan": _scan,
     "squeeze": _reshape, "expand_dims": _reshape,
+    "reshard": lambda self, eqn, ins: [ins[0]],  # of a constant, within shard_map
     "transpose": lambda self, eqn, ins: [np.transpose(ins[0], eqn.params["permutation"])],
     "concatenate": lambda self, eqn, ins: [np.concatenate(ins, axis=eqn.params["dimension"])],
     "rev": lambda self, eqn, ins: [np.flip(ins[0], eqn.params["dimensions"])],

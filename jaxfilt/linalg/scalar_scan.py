@@ -13,7 +13,7 @@ from jax import lax
 
 from jaxfilt import checkpointed
 from jaxfilt.linalg import segments, structure
-from jaxfilt.linalg.entries import NoScalarForm, assemble, entries, is_known, shaped
+from jaxfilt.linalg.entries import NoScalarForm, entries, is_known, shaped
 from jaxfilt.linalg.scalarize import Interpreter
 
 PyTree = Any
@@ -100,9 +100,15 @@ def scan(
     if after[2] > limit:
         raise NoScalarForm(f"more than {limit} scalar operations")
 
+    # Of the outputs too a step gives what varies; the rest is put in at the end.
+    plans = [_distinct(entry)[0] for entry in after[1]]
+
     def body(carry, x):
         after, outs, _ = run(classes, carry, x)
-        return _carry(classes, after, dtypes), [assemble(y, a) for y, a in zip(outs, out_avals, strict=True)]
+        given = [
+            jnp.stack(_distinct(entry)[1] or [jnp.zeros((), a.dtype)]) for entry, a in zip(outs, out_avals, strict=True)
+        ]
+        return _carry(classes, after, dtypes), given
 
     carry = _carry(classes, flat, dtypes)
     if after[2] > segments.MANY:
@@ -110,7 +116,9 @@ def scan(
     # Checkpointed: the reverse pass keeps the carry only and computes one step again.
     body = jax.checkpoint(body, prevent_cse=False)
     _, outs = collect(body, carry, split, keep, segment)
-    return jax.tree.unflatten(out_tree, outs)
+    steps = rows[0].shape[0] if keep == "sum" else 1
+    expanded = [_expand(x, plan, a, steps) for x, plan, a in zip(outs, plans, out_avals, strict=True)]
+    return jax.tree.unflatten(out_tree, expanded)
 
 
 def collect(
@@ -141,6 +149,33 @@ def collect(
 
 def _add(a, b):
     return a + b if jnp.issubdtype(a.dtype, jnp.inexact) else a | b
+
+
+def _distinct(out):
+    """For each entry its value, if it is known, or its number among the distinct ones; and these."""
+    numbers: dict[int, int] = {}
+    distinct: list[Any] = []
+    plan: list[Any] = []
+    for x in out.ravel():
+        if not is_known(x) and id(x) not in numbers:
+            numbers[id(x)] = len(distinct)
+            distinct.append(x)
+        plan.append(x if is_known(x) else numbers[id(x)])
+    return plan, distinct
+
+
+def _expand(x, plan, aval, steps):
+    """The output (..., *shape) from its distinct entries (..., k); known floats are those of ``steps`` steps."""
+    if plan == list(range(x.shape[-1])):
+        return x.reshape(*x.shape[:-1], *aval.shape)
+    columns = []
+    for entry in plan:
+        if is_known(entry):
+            value = entry * steps if jnp.issubdtype(aval.dtype, jnp.inexact) else entry
+            columns.append(jnp.full(x.shape[:-1], value, aval.dtype))
+        else:
+            columns.append(x[..., entry])
+    return jnp.stack(columns, axis=-1).reshape(*x.shape[:-1], *aval.shape)
 
 
 def _columns(leaf):

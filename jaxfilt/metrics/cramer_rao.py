@@ -64,7 +64,7 @@ def posterior_bound(
     Raises:
         ValueError: wrong shapes, a (concrete) P0 that is no covariance.
     """
-    model = as_nonlinear(model) if isinstance(model, LinearGaussian) else model
+    model = as_nonlinear(model)
     states = jnp.asarray(states, model.m0.dtype)
     states = states[None] if states.ndim == 2 else states
     n = model.m0.shape[0]
@@ -112,7 +112,7 @@ def start_bound(
     Raises:
         ValueError: wrong shapes, a (concrete) prior that is no covariance.
     """
-    model = as_nonlinear(model) if isinstance(model, LinearGaussian) else model
+    model = as_nonlinear(model)
     x0 = jnp.asarray(x0, model.m0.dtype)
     if x0.shape != model.m0.shape:
         raise ValueError(f"x0: expected shape {model.m0.shape}, got {x0.shape}")

@@ -10,7 +10,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import Static, is_concrete
-from jaxfilt.models.linear import LinearGaussian, common_dtype
+from jaxfilt.models.linear import LinearGaussian, check_linear, common_dtype
 
 
 def delay_probabilities(alpha: Any) -> Array:
@@ -61,6 +61,12 @@ def check_probabilities(name: str, p: Array) -> None:
         raise ValueError(f"{name}: expected probabilities that sum to 1, got {a.tolist()}")
 
 
+def check_delay(max_delay: Any) -> None:
+    """Raises a ValueError if ``max_delay`` is no integer of at least 0."""
+    if isinstance(max_delay, bool) or not isinstance(max_delay, int | np.integer) or max_delay < 0:
+        raise ValueError(f"max_delay: expected an integer >= 0, got {max_delay!r}")
+
+
 def with_lags(model: LinearGaussian, max_delay: int) -> LinearGaussian:
     """The model with its d last states: a late measurement with a time stamp is then a measurement like any other.
 
@@ -77,8 +83,8 @@ def with_lags(model: LinearGaussian, max_delay: int) -> LinearGaussian:
     Raises:
         ValueError: d < 0, H or R that are functions, a model with D, or with correlated noise S (not covered).
     """
-    if max_delay < 0:
-        raise ValueError(f"max_delay: expected at least 0, got {max_delay}")
+    check_linear(model)
+    check_delay(max_delay)
     H, R = model.H, model.R
     if callable(H) or callable(R):
         raise ValueError("model: H and R must be matrices, since a late packet was made at an earlier step")
@@ -116,6 +122,7 @@ def lag_inputs(ys: Any, lag: Any, max_delay: int) -> dict[str, Array]:
         TypeError: a lag that is not an integer.
     """
     common_dtype({"ys": ys})
+    check_delay(max_delay)
     ys, lag = jnp.asarray(ys), jnp.asarray(lag)
     if ys.ndim != 2:
         raise ValueError(f"ys: expected shape (T, m), got {ys.shape}")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import PyTree, aspartial, is_concrete
+from jaxfilt.core import PyTree, aspartial, is_concrete, numbers
 from jaxfilt.linalg.structure import array, diagonal, repeat
 
 Matrix = Array | Callable[[PyTree, Array | None], Array]
@@ -63,7 +63,8 @@ def linear_gaussian(
         TypeError: integer arrays, or arrays of different float dtypes.
     """
     given = {"F": F, "H": H, "Q": Q, "R": R, "m0": m0, "P0": P0, "B": B, "D": D, "S": S}
-    dtype = common_dtype({name: x for name, x in given.items() if not callable(x)})
+    optional = {name for name in ("B", "D", "S") if given[name] is None}
+    dtype = common_dtype({name: x for name, x in given.items() if not callable(x) and name not in optional})
     a: dict[str, Any] = {}
     for name, x in given.items():
         a[name] = aspartial(x) if callable(x) else None if x is None else array(x, dtype)
@@ -75,7 +76,7 @@ def linear_gaussian(
         "F": (n, n), "H": (m, n), "Q": (n, n), "R": (m, m), "P0": (n, n), "B": (n, None), "D": (m, None), "S": (n, m),
     }.items():  # fmt: skip
         if a[name] is not None and not callable(a[name]):
-            check_shape(name, a[name], shape)
+            check_shape(name, a[name], shape, f" with m0 of {n} components")
             if name in ("Q", "R", "P0"):
                 check_covariance(name, a[name])
             else:
@@ -99,6 +100,10 @@ def measurement_covariance(r: Array, d: int) -> Array:
     """
     if r.shape not in ((), (d,), (d, d)):
         raise ValueError(f"r: expected a scalar, shape ({d},) or ({d}, {d}), got {r.shape}")
+    if r.ndim == 2:
+        check_covariance("r", r)
+    else:
+        check_positive("r", r, zero=True)
     return r if r.ndim == 2 else diagonal(repeat(r, d))
 
 
@@ -110,7 +115,7 @@ def common_dtype(arrays: dict[str, Any]) -> np.dtype:
     """
     dtypes = {}
     for name, x in arrays.items():
-        for leaf in jax.tree.leaves(x):
+        for leaf in [x] if x is None else jax.tree.leaves(x):
             if hasattr(leaf, "dtype"):
                 if not jnp.issubdtype(leaf.dtype, jnp.floating):
                     raise TypeError(f"{name}: expected a float array, got {leaf.dtype}")
@@ -124,21 +129,27 @@ def common_dtype(arrays: dict[str, Any]) -> np.dtype:
     return next(iter(dtypes.values()), jnp.zeros(()).dtype)
 
 
-def check_shape(name: str, x: Array, shape: tuple[int | None, ...]) -> None:
-    """Raises a ValueError that names ``x`` if its shape is not as expected; None matches any size."""
+def check_linear(model: Any, name: str = "model") -> None:
+    """Raises a TypeError that names the argument if it is no linear-Gaussian model."""
+    if not isinstance(model, LinearGaussian):
+        raise TypeError(f"{name}: expected a linear-Gaussian model, got {type(model).__name__}")
+
+
+def check_shape(name: str, x: Any, shape: tuple[int | None, ...], why: str = "") -> None:
+    """Raises a ValueError that names ``x`` if its shape is not as expected (``why``); None matches any size."""
     try:
         chex.assert_shape(x, shape)
     except AssertionError:
         wanted = (
             "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"
         )
-        raise ValueError(f"{name}: expected shape {wanted}, got {jnp.shape(x)}") from None
+        raise ValueError(f"{name}: expected shape {wanted}{why}, got {jnp.shape(x)}") from None
 
 
 def check_finite(name: str, x: Any) -> None:
     """Raises a ValueError that names ``x`` if it is concrete and has a NaN or infinite entry."""
-    if is_concrete(x) and not np.isfinite(np.asarray(x)).all():
-        raise ValueError(f"{name}: expected finite values, got {np.asarray(x)}")
+    if is_concrete(x) and not np.isfinite(a := numbers(name, x)).all():
+        raise ValueError(f"{name}: expected finite values, got {a}")
 
 
 def check_covariance(name: str, x: Any) -> None:
@@ -152,6 +163,8 @@ def check_covariance(name: str, x: Any) -> None:
     check_finite(name, x)
     eps = float(jnp.finfo(jnp.asarray(x).dtype).eps)
     A = np.asarray(x, np.float64)
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
+        raise ValueError(f"{name}: expected shape (n, n), got {A.shape}")
     size = np.abs(A).max()
     if np.abs(A - A.T).max() > max(1e-8, 10 * eps) * size:
         raise ValueError(f"{name}: expected a symmetric matrix, got {A.tolist()}")
@@ -166,6 +179,6 @@ def check_covariance(name: str, x: Any) -> None:
 def check_positive(name: str, x: Any, *, zero: bool = False) -> None:
     """Raises a ValueError that names ``x`` if it is concrete and not positive (or, with ``zero``, negative)."""
     if is_concrete(x):
-        a = np.asarray(x)
+        a = numbers(name, x)
         if not (np.isfinite(a) & ((a >= 0) if zero else (a > 0))).all():
             raise ValueError(f"{name}: expected a finite value {'>= 0' if zero else '> 0'}, got {a}")

@@ -16,7 +16,14 @@ from jax.tree_util import Partial
 
 from jaxfilt.core import Static
 from jaxfilt.linalg.structure import array, repeat
-from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian, measurement_covariance
+from jaxfilt.models.linear import (
+    LinearGaussian,
+    check_positive,
+    check_shape,
+    common_dtype,
+    linear_gaussian,
+    measurement_covariance,
+)
 
 # The direction g of one step's noise for noise="piecewise", as powers dt^p / p!: by how many derivatives
 # the state holds. Constant acceleration over the interval for CV, an acceleration (jerk) increment for CA (CJ).
@@ -80,6 +87,7 @@ def _motion_model(order, dt, q, r, m0, P0, noise):
     check_positive("dt", dt)
     check_positive("q", q, zero=True)
     dtype = common_dtype({"dt": dt, "q": q, "r": r, "m0": m0, "P0": P0})
+    check_shape("dt", dt, ())
     m0 = array(m0, dtype)
     if m0.ndim != 1 or m0.size == 0 or m0.size % order:
         raise ValueError(f"m0: expected shape ({order} d,) for d axes, got {m0.shape}")

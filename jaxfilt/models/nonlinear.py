@@ -12,7 +12,15 @@ from jax.tree_util import Partial
 
 from jaxfilt.core import PyTree, aspartial
 from jaxfilt.linalg.structure import array
-from jaxfilt.models.linear import LinearGaussian, check_covariance, check_finite, check_shape, common_dtype, value
+from jaxfilt.models.linear import (
+    LinearGaussian,
+    check_covariance,
+    check_finite,
+    check_linear,
+    check_shape,
+    common_dtype,
+    value,
+)
 
 Function = Callable[[Array, PyTree, Array | None], Array]
 
@@ -81,11 +89,11 @@ def nonlinear(
     m = None if callable(R) else jnp.shape(a["R"])[0] if jnp.ndim(a["R"]) else None
     for name, size in (("Q", n), ("R", m), ("P0", n)):
         if not callable(a[name]):
-            check_shape(name, a[name], (size, size))
+            check_shape(name, a[name], (size, size), f" with m0 of {n} components")
             check_covariance(name, a[name])
     return Nonlinear(
-        aspartial(f), aspartial(h), **a,
-        residual=_optional(residual), f_jacobian=_optional(f_jacobian), h_jacobian=_optional(h_jacobian),
+        aspartial(f, "f"), aspartial(h, "h"), **a, residual=_optional("residual", residual),
+        f_jacobian=_optional("f_jacobian", f_jacobian), h_jacobian=_optional("h_jacobian", h_jacobian),
     )  # fmt: skip
 
 
@@ -100,9 +108,10 @@ def with_sensor(motion: LinearGaussian | Nonlinear, sensor: Sensor) -> Nonlinear
         ValueError: an indefinite R, or a motion model whose noise is correlated with its old sensor's (S).
         TypeError: R of another float dtype than the motion model's.
     """
-    if isinstance(motion, LinearGaussian):
-        motion = as_nonlinear(motion)
-    R, residual = sensor.R, _optional(sensor.residual)
+    motion = as_nonlinear(motion, "motion")
+    if not isinstance(sensor, Sensor):
+        raise TypeError(f"sensor: expected a Sensor, got {type(sensor).__name__}")
+    R, residual = sensor.R, _optional("residual", sensor.residual)
     if not callable(R):
         R = array(R, common_dtype({"R": R, "m0": motion.m0}))
         check_shape("R", R, (R.shape[0] if R.ndim else None,) * 2)
@@ -112,14 +121,18 @@ def with_sensor(motion: LinearGaussian | Nonlinear, sensor: Sensor) -> Nonlinear
     )
 
 
-def as_nonlinear(model: LinearGaussian) -> Nonlinear:
-    """A linear-Gaussian model in nonlinear form, with its matrices as Jacobians.
+def as_nonlinear(model: LinearGaussian | Nonlinear, name: str = "model") -> Nonlinear:
+    """A linear-Gaussian model in nonlinear form, with its matrices as Jacobians; a nonlinear one as it is.
 
     Raises:
         ValueError: a model with correlated noise (S), which the nonlinear form does not have.
+        TypeError: what is no model; it names the argument.
     """
+    if isinstance(model, Nonlinear):
+        return model
+    check_linear(model, name)
     if model.S is not None:
-        raise ValueError("model: noise correlated between process and measurement (S) has no nonlinear form")
+        raise ValueError(f"{name}: noise correlated between process and measurement (S) has no nonlinear form")
     Q = Partial(_linear_covariance, model.Q) if callable(model.Q) else model.Q
     R = Partial(_linear_covariance, model.R) if callable(model.R) else model.R
     return Nonlinear(
@@ -139,8 +152,8 @@ def jacobian(fn: Function, given: Function | None, x: Array, u: PyTree, dt: Arra
     return jax.jacfwd(fn)(x, u, dt) if given is None else given(x, u, dt)
 
 
-def _optional(fn):
-    return None if fn is None else aspartial(fn)
+def _optional(name, fn):
+    return None if fn is None else aspartial(fn, name)
 
 
 def _linear_transition(F, B, x, u, dt):

@@ -17,7 +17,7 @@ from jax import Array
 from jax.tree_util import Partial
 
 from jaxfilt.core import Static, aspartial, is_concrete
-from jaxfilt.models.linear import check_covariance, check_positive, common_dtype
+from jaxfilt.models.linear import check_covariance, check_finite, check_positive, common_dtype
 from jaxfilt.models.nonlinear import Sensor
 
 
@@ -114,12 +114,19 @@ def wrap_at(components: Static, y: Array, predicted: Array) -> Array:
 
 
 def _observer(observer: Any) -> Any:
-    return aspartial(observer) if callable(observer) else observer
+    if observer is None or callable(observer):
+        return observer if observer is None else aspartial(observer)
+    common_dtype({"observer": observer})
+    check_finite("observer", observer)
+    if jnp.shape(jnp.asarray(observer)) not in ((2,), (4,)):
+        raise ValueError(f"observer: expected shape (2,) or (4,), got {jnp.shape(jnp.asarray(observer))}")
+    return observer
 
 
 def _covariance(R: Any, m: int) -> Any:
     if callable(R):
         return aspartial(R)
+    common_dtype({"R": R})
     if jnp.shape(jnp.asarray(R)) != (m, m):
         raise ValueError(f"R: expected shape ({m}, {m}), got {jnp.shape(jnp.asarray(R))}")
     check_covariance("R", R)

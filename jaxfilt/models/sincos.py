@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 
 from jaxfilt.core import is_concrete
 from jaxfilt.linalg.structure import array
-from jaxfilt.models.linear import check_positive, common_dtype, measurement_covariance
+from jaxfilt.models.linear import check_positive, check_shape, common_dtype, measurement_covariance
 from jaxfilt.models.nonlinear import Nonlinear, nonlinear
 from jaxfilt.sincos import Parameters, check_parameters, signals
 
@@ -51,10 +51,13 @@ def sine_cosine(
         TypeError: integer arrays or mixed float dtypes.
     """
     p = Parameters() if parameters is None else parameters
-    dtype = common_dtype({"dt": dt, "q": q, "r": r, "m0": m0, "P0": P0, "drift": drift, "parameters": tuple(p)})
+    check_parameters(p)
+    given = {"dt": dt, "q": q, "r": r, "m0": m0, "P0": P0, "drift": 0.0 if drift is None else drift}
+    dtype = common_dtype({**given, "parameters": tuple(p)})
+    check_shape("dt", dt, ())
+    check_shape("q", q, ())
     check_positive("dt", dt)
     check_positive("q", q, zero=True)
-    check_parameters(p)
     m0 = array(m0, dtype)
     if m0.shape not in ((2,), (8,)):
         raise ValueError(f"m0: expected shape (2,) or (8,), got {m0.shape}")

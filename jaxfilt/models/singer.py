@@ -12,7 +12,14 @@ from jax.tree_util import Partial
 from jaxfilt.core import is_concrete
 from jaxfilt.linalg.structure import array, repeat
 from jaxfilt.models.discretise import van_loan
-from jaxfilt.models.linear import LinearGaussian, check_positive, common_dtype, linear_gaussian, measurement_covariance
+from jaxfilt.models.linear import (
+    LinearGaussian,
+    check_positive,
+    check_shape,
+    common_dtype,
+    linear_gaussian,
+    measurement_covariance,
+)
 
 
 class _Singer(NamedTuple):
@@ -48,6 +55,8 @@ def singer(*, dt: Any, tau: Any, variance: Any, r: Any, m0: Any, P0: Any) -> Lin
     check_positive("tau", tau)
     check_positive("variance", variance, zero=True)
     dtype = common_dtype({"dt": dt, "tau": tau, "variance": variance, "r": r, "m0": m0, "P0": P0})
+    check_shape("dt", dt, ())
+    check_shape("tau", tau, ())
     m0 = array(m0, dtype)
     if m0.ndim != 1 or m0.size == 0 or m0.size % 3:
         raise ValueError(f"m0: expected shape (3 d,) for d axes, got {m0.shape}")

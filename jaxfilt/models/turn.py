@@ -109,7 +109,8 @@ def _check(dt, q, r, m0, P0, n, omega=None, q_omega=None):
     check_positive("dt", dt)
     check_positive("q", q, zero=True)
     given = {"dt": dt, "q": q, "r": r, "m0": m0, "P0": P0, "omega": omega, "q_omega": q_omega}
-    dtype = common_dtype({name: x for name, x in given.items() if x is not None})
+    unused = "q_omega" if q_omega is None else "omega"
+    dtype = common_dtype({name: x for name, x in given.items() if name != unused})
     m0 = array(m0, dtype)
     check_shape("m0", m0, (n,))
     r = array(r, dtype)

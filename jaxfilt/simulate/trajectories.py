@@ -13,7 +13,7 @@ from jaxfilt import core
 from jaxfilt.core import PyTree, StepInput
 from jaxfilt.filters.kalman import input_term
 from jaxfilt.linalg import chol, solve_chol, sym
-from jaxfilt.models.linear import LinearGaussian, check_finite, check_shape, value
+from jaxfilt.models.linear import LinearGaussian, check_finite, check_linear, check_shape, value
 
 
 class Simulated(NamedTuple):
@@ -58,6 +58,7 @@ def simulate(
         ValueError: T < 1, wrong shapes, negative dt, a non-finite x0.
         TypeError: integer arrays or another float dtype than the model's.
     """
+    check_linear(model)
     stacked = _inputs(T, model.m0.dtype, dt, u, key)
     if x0 is not None:
         x0 = _state("x0", x0, model, ())
@@ -70,6 +71,7 @@ def measure(model: LinearGaussian, states: Any, key: Array, *, dt: Any = None, u
     Step k takes ``fold_in(key, k + 1)``. The other arguments and errors are as in :func:`simulate`; the model's S plays
     no part, since the process noise is not known.
     """
+    check_linear(model)
     states = _state("states", states, model, (None,))
     return _measure(model, states, _inputs(states.shape[0], model.m0.dtype, dt, u, key))
 

@@ -47,6 +47,7 @@ def filter_batch(
     first_update_only: bool = False,
 ) -> PyTree:
     """The outputs of all runs, leading (B, T). Give a module-level function as ``outputs``: another one traces anew."""
+    core.check_filter(filt)
     runs, _, _ = batch_shape(ys)
     mask = None if mask is None else full_mask(ys, mask)
     keys = None if key is None else run_keys(key, runs)
@@ -61,8 +62,11 @@ def filter_batch(
 
 def batch_shape(ys: Array) -> tuple[int, int, int]:
     """(B, T, m). Raises ValueError for another rank."""
+    if not hasattr(ys, "ndim"):
+        ys = core.numbers("ys", ys)
     if np.ndim(ys) != 3:
         raise ValueError(f"ys: expected shape (B, T, m), got {jnp.shape(ys)}")
+    core.check_float("ys", ys)
     runs, T, m = jnp.shape(ys)
     return runs, T, m
 
@@ -74,6 +78,7 @@ def dt_axis(dt: Any) -> int | None:
 
 def run_keys(key: Array, runs: int) -> Array:
     """One key (B,) per run, the same for any number of runs."""
+    core.check_key(key)
     return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(runs))
 
 
@@ -90,6 +95,7 @@ def full_mask(ys: Array, mask: Array | None) -> Array:
 
 def any_present(ys: Array, mask: Array | None, warmup: int) -> Array:
     """(B, T) bool: at least one component present, none of these non-finite, and not in the warm-up."""
+    core.check_count("warmup", warmup, 0)
     runs, T, _ = batch_shape(ys)
     mask = full_mask(ys, mask)
     # Filters ignore the innovation of an unmasked NaN: to score it as zero would flatter.

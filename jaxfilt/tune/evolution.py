@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import aspartial
+from jaxfilt.core import aspartial, check_count, check_key, numbers
 from jaxfilt.linalg import structure
+from jaxfilt.models.linear import check_finite
 from jaxfilt.tune import params as spaces
-from jaxfilt.tune.result import Front, TuneResult, make_result, rounds
+from jaxfilt.tune.result import Front, TuneResult, check_time_limit, make_result, rounds
 
 PyTree = Any
 
@@ -49,7 +50,7 @@ def genetic(
         ImportError: if pymoo is missing.
         ValueError: nothing to tune in ``space``, ``population`` below 2 or ``generations`` below 1.
     """
-    losses = jax.tree_util.Partial(_as_vector, aspartial(loss))
+    losses = jax.tree_util.Partial(_as_vector, aspartial(loss, "loss"))
     options = {"population": population, "generations": generations, "time_limit": time_limit, "progress": progress}
     best, _, rows, compile_time = _evolve("genetic", losses, space, data, key, None, **options)
     return make_result(spaces.constrain(space, best[0]), best[1], rows, compile_time, "genetic")
@@ -88,7 +89,7 @@ def nsga2(
         ImportError: if pymoo is missing.
         ValueError: as in :func:`genetic`, or ``weights`` of another length.
     """
-    losses = aspartial(losses)
+    losses = aspartial(losses, "losses")
     options = {"population": population, "generations": generations, "time_limit": time_limit, "progress": progress}
     best, front, rows, compile_time = _evolve("nsga2", losses, space, data, key, weights, **options)
     members = jax.vmap(spaces.constrain, (None, 0))(space, front[0])
@@ -97,10 +98,10 @@ def nsga2(
 
 def _evolve(method, losses, space, data, key, weights, *, population, generations, time_limit, progress):
     """Returns ``(z, loss)`` of the best, ``(z (k, d), losses (k, objectives))`` of the front, rows and compile time."""
-    if population < 2:
-        raise ValueError(f"population: expected at least 2, got {population}")
-    if generations < 1:
-        raise ValueError(f"generations: expected at least 1, got {generations}")
+    check_key(key)
+    check_count("population", population, 2)
+    check_count("generations", generations, 1)
+    check_time_limit(time_limit)
     if spaces.size(space) == 0:
         raise ValueError("space: expected at least one spec, but every leaf is a plain value")
     pymoo = _pymoo()
@@ -113,7 +114,8 @@ def _evolve(method, losses, space, data, key, weights, *, population, generation
     labels = structure.of(losses)
     evaluate = _evaluate.lower(losses, space, data, first, labels).compile()
     objectives = evaluate.out_info.shape[1]
-    weights = np.ones(objectives) if weights is None else np.asarray(weights, np.float64)
+    weights = np.ones(objectives) if weights is None else numbers("weights", weights).astype(np.float64)
+    check_finite("weights", weights)
     if weights.shape != (objectives,):
         raise ValueError(f"weights: expected shape ({objectives},), got {weights.shape}")
     bars = rounds(generations, method, progress)

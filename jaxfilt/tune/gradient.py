@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxfilt.core import aspartial
+from jaxfilt.core import aspartial, check_count, check_key
 from jaxfilt.linalg import structure
+from jaxfilt.models.linear import check_finite
 from jaxfilt.tune import params as spaces
-from jaxfilt.tune.result import TuneResult, make_result, rounds
+from jaxfilt.tune.result import TuneResult, check_time_limit, make_result, rounds
 
 PyTree = Any
 
@@ -69,14 +70,18 @@ def gradient(
     Raises:
         ValueError: nothing to tune in ``space``, or counts below 1.
     """
+    if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
+        raise TypeError(f"optimizer: expected an optax optimizer, got {type(optimizer).__name__}")
+    check_key(key)
+    check_finite("spread", spread)
+    check_time_limit(time_limit)
     optimizer = optax.with_extra_args_support(_ADAM if optimizer is None else optimizer)
     for name, count in (("steps", steps), ("starts", starts), ("block", block)):
-        if count < 1:
-            raise ValueError(f"{name}: expected at least 1, got {count}")
+        check_count(name, count, 1)
     if spaces.size(space) == 0:
         raise ValueError("space: expected at least one spec, but every leaf is a plain value")
     begun = time.perf_counter()
-    loss = aspartial(loss)
+    loss = aspartial(loss, "loss")
     z0 = spaces.to_vector(space)
     others = z0[None, :] + spread * (spaces.sample(space, key, starts - 1) - z0[None, :])
     search = _begin(jnp.concatenate([z0[None, :], others]), optimizer)

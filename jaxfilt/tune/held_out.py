@@ -49,6 +49,7 @@ def masked_nll(
     Raises:
         ValueError: gaps that do not fit, a filter without likelihood, or wrong shapes.
     """
+    core.check_filter(filt)
     runs, T, _ = batch_shape(ys)
     dt, u, u_axis = (options.get(name) for name in ("dt", "u", "u_axis"))
     keys = run_keys(key, runs)
@@ -75,7 +76,14 @@ def random_gap(key: Array, T: int, *, length: tuple[int, int], warmup: int = 1) 
     Raises:
         ValueError: if the longest gap does not fit.
     """
+    core.check_key(key)
+    core.check_count("T", T, 1)
+    if not isinstance(length, tuple | list) or len(length) != 2:
+        raise ValueError(f"length: expected (shortest, longest), got {length!r}")
     shortest, longest = length
+    for end in length:
+        core.check_count("length", end, 1)
+    core.check_count("warmup", warmup, 0)
     if not 1 <= shortest <= longest:
         raise ValueError(f"length: expected 1 <= shortest <= longest, got {length}")
     if warmup < 0 or warmup + longest >= T:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxfilt import core
 from jaxfilt.core import Filter, Info, Status
 from jaxfilt.linalg import chol, solve_lower
 from jaxfilt.tune.batch import Options, any_present, batch_shape, filter_batch, weighted_mean
@@ -157,7 +158,8 @@ def _in_window(ys, window):
         inside = np.zeros(T, bool)
         inside[slice(None) if window is None else window] = True
         window = inside
-    window = jnp.asarray(window)
+    if not hasattr(window, "dtype"):
+        window = core.numbers("window", window)
     if window.shape not in {(T,), (runs, T)}:
         raise ValueError(f"window: expected a slice or shape ({T},) or ({runs}, {T}), got {window.shape}")
     if window.dtype != np.dtype(bool):
@@ -167,13 +169,18 @@ def _in_window(ys, window):
 
 def _indices(truth, components):
     """The chosen components as an index array; ``truth`` may lack components after the last of them."""
+    core.check_float("truth", truth)
+    if jnp.ndim(truth) != 3:
+        raise ValueError(f"truth: expected shape (B, T, n), got {jnp.shape(truth)}")
     n = jnp.shape(truth)[-1]
     chosen = slice(None) if components is None else components
+    if not isinstance(chosen, slice | tuple | list | np.ndarray):
+        raise TypeError(f"components: expected indices or a slice, got {components!r}")
     if not isinstance(chosen, slice):
         chosen = list(chosen)
     try:
         return np.atleast_1d(np.arange(n)[chosen])
-    except IndexError:
+    except (IndexError, TypeError):
         raise ValueError(f"components: {components} do not exist in truth of shape {jnp.shape(truth)}") from None
 
 

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxfilt import core
 from jaxfilt.tune.transforms import REACH, TRANSFORMS
 
 PyTree = Any
@@ -147,7 +148,7 @@ def covariance(init: Any, factor: float = 1e3) -> Spec:
         raise ValueError(f"init: expected shape (n, n), got {x.shape}")
     if not np.allclose(x, x.T, rtol=1e-5, atol=0.0):
         raise ValueError("init: expected a symmetric matrix")
-    if not factor > 1:
+    if not 1 < core.number("factor", factor) < np.inf:
         raise ValueError(f"factor: expected more than 1, got {factor}")
     try:
         L = np.linalg.cholesky(x)
@@ -207,6 +208,8 @@ def constrain(space: PyTree, z: Array) -> PyTree:
     Raises:
         ValueError: if ``z`` has another shape.
     """
+    if not hasattr(z, "dtype"):
+        z = jnp.asarray(core.numbers("z", z))
     if jnp.shape(z) != (size(space),):
         raise ValueError(f"z: expected shape ({size(space)},), got {jnp.shape(z)}")
     leaves, structure = jax.tree.flatten(space, is_leaf=_is_spec)
@@ -231,6 +234,8 @@ def bounds(space: PyTree) -> tuple[Array, Array]:
 
 def sample(space: PyTree, key: Array, n: int) -> Array:
     """``n`` points ``z (n, d)``, uniform in the box."""
+    core.check_key(key)
+    core.check_count("n", n, 0)
     low, high = bounds(space)
     u = jax.random.uniform(key, (n, low.size), low.dtype)
     return low[None, :] + u * (high - low)[None, :]
@@ -274,7 +279,7 @@ def _args(spec: Spec, dtype: Any) -> tuple[Array, ...]:
 
 
 def _concrete(name: str, x: Any) -> tuple[np.ndarray, np.dtype | None]:
-    array = np.asarray(x, np.float64)
+    array = core.numbers(name, x).astype(np.float64)
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite values, got {x}")
     return array, x.dtype if _is_float_array(x) else None

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfilt.core import number
+
 PyTree = Any
 
 
@@ -76,6 +78,12 @@ def make_result(
     evaluations, wall_time, best_loss = zip(*rows, strict=True)
     history = History(np.asarray(evaluations, np.int64), np.asarray(wall_time), np.asarray(best_loss, np.float64))
     return TuneResult(params, float(loss), history, evaluations[-1], wall_time[-1], compile_time, method, front)
+
+
+def check_time_limit(time_limit: Any) -> None:
+    """Raises an error that names ``time_limit`` if it is neither None nor a number >= 0."""
+    if time_limit is not None and not number("time_limit", time_limit) >= 0:
+        raise ValueError(f"time_limit: expected seconds >= 0, got {time_limit}")
 
 
 def rounds(total: int, method: str, progress: bool) -> Iterable[int]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import Array
 
 from jaxfilt.core import Filter, Info, PyTree, StepInput
+from jaxfilt.core import check_count as check_count
 
 
 def predict_measurement(filt: Filter, state: PyTree, inp: StepInput) -> tuple[Array, Info]:
@@ -26,9 +25,3 @@ def covariances(info: Info, wrapper: str) -> tuple[Array, Array]:
     if info.innovation_cov is None or info.noise_cov is None:
         raise ValueError(f"filt: {wrapper} needs a filter that reports innovation_cov and noise_cov")
     return info.innovation_cov, info.noise_cov
-
-
-def check_count(name: str, value: Any, least: int) -> None:
-    """Raises a ValueError that names an option if it is no integer of at least ``least``."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")

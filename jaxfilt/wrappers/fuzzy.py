@@ -125,6 +125,8 @@ def fuzzy_scaled(
     if input not in ("innovation", "difference"):
         raise ValueError(f'input: expected "innovation" or "difference", got {input!r}')
     _check_which(scale)
+    if not isinstance(system, fuzzy.Mamdani):
+        raise TypeError(f"system: expected a jf.fuzzy.Mamdani, got {type(system).__name__}")
     for name, x in (("unit", unit), ("reference", reference), ("floor", floor)):
         check_positive(name, x)
     for name, x in (("r_exponent", r_exponent), ("q_exponent", q_exponent)):
@@ -221,6 +223,8 @@ def fuzzy_noise(
     """
     _check_which(scale)
     check_positive("unit", unit)
+    if not isinstance(parameters, FuzzyNoise):
+        raise TypeError(f"parameters: expected a FuzzyNoise, got {type(parameters).__name__}")
     if np.ndim(parameters.gaps) != 2:
         raise ValueError(f"gaps: expected shape (m, L - 1), got {np.shape(parameters.gaps)}")
     m, crossings = np.shape(parameters.gaps)

@@ -201,7 +201,7 @@ def check_rate(rate: Any, *, closed: bool = False) -> None:
 
 def check_bounds(name: str, bounds: Any) -> tuple[Any, Any]:
     """``(smallest, largest)``, or a ValueError that names them."""
-    if len(bounds) != 2:
+    if not hasattr(bounds, "__len__") or len(bounds) != 2:
         raise ValueError(f"{name}: expected (smallest, largest), got {bounds}")
     check_positive(name, bounds[0])
     if is_concrete(bounds) and not bounds[0] <= bounds[1]:

@@ -13,7 +13,7 @@ from jaxfilt import maneuver
 from jaxfilt.chi2 import chi2_quantile
 from jaxfilt.core import Filter, Prediction, Static, StepInput, bind, is_concrete, present
 from jaxfilt.filters.kalman import KalmanState, kalman, measurement
-from jaxfilt.models.linear import LinearGaussian, common_dtype, value
+from jaxfilt.models.linear import LinearGaussian, check_linear, common_dtype, value
 from jaxfilt.wrappers.adaptive import select
 from jaxfilt.wrappers.common import check_count
 
@@ -105,6 +105,8 @@ def variable_dimension(
     end_probability = maneuver.static_number("end_probability", end_probability)
     if not 0 < end_probability < 1:
         raise ValueError(f"end_probability: expected a value in (0, 1), got {end_probability}")
+    check_linear(model_cv, "model_cv")
+    check_linear(model_ca, "model_ca")
     common_dtype({"model_cv": model_cv.m0, "model_ca": model_ca.m0})
     d = model_cv.m0.shape[0] // 2
     for name, model, order in (("model_cv", model_cv, 2), ("model_ca", model_ca, 3)):
