@@ -193,3 +193,16 @@ def test_unpack_needs_a_triangle():
         jf.filter(jf.alpha_beta(0.5, 0.3, dt=1.0), YS, outputs=jf.packed)
     with pytest.raises(ValueError, match="keep: expected"):
         jf.filter(KALMAN, YS, keep="all")
+
+
+@pytest.mark.parametrize("form", ["dense", "scalar"])
+def test_a_sum_in_float32_does_not_lose_small_terms(form):
+    """20000 steps: a plain float32 sum would be off by some 1e-5 of itself, a thousand times as much."""
+    model = jf.models.constant_velocity(
+        dt=1.0, q=0.1, r=25.0, m0=np.zeros(2, np.float32), P0=np.eye(2, dtype=np.float32)
+    )
+    ys = np.random.default_rng(0).normal(0, 5, (20000, 1)).astype(np.float32)
+    each = np.asarray(jf.filter(jf.kalman(model), ys, outputs=jf.log_lik, form=form), np.float64)
+    total = jf.filter(jf.kalman(model), ys, outputs=jf.log_lik, keep="sum", form=form)
+    assert total.dtype == np.float32
+    np.testing.assert_allclose(total, each.sum(), rtol=2e-7)

@@ -140,15 +140,27 @@ def collect(
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), spec)
 
     def both(state, x):
-        carry, kept = state
+        carry, kept, lost = state
         carry, out = body(carry, x)
-        return (carry, out if keep == "last" else jax.tree.map(_add, kept, out)), None
+        if keep == "last":
+            return (carry, out, lost), None
+        leaves, tree = jax.tree.flatten(kept)
+        added = [_add(*each) for each in zip(leaves, jax.tree.leaves(lost), jax.tree.leaves(out), strict=True)]
+        return (carry, *(tree.unflatten(part) for part in zip(*added, strict=True))), None
 
-    return run(both, (carry, empty), xs)[0]
+    carry, kept, _ = run(both, (carry, empty, empty), xs)[0]
+    return carry, kept
 
 
-def _add(a, b):
-    return a + b if jnp.issubdtype(a.dtype, jnp.inexact) else a | b
+def _add(total, lost, x):
+    """The sum and what its rounding lost, which in float32 goes into the next one (Kahan): 1e6 steps add up."""
+    if not jnp.issubdtype(x.dtype, jnp.inexact):
+        return total | x, lost
+    if x.dtype == jnp.float64:
+        return total + x, lost
+    x = x - lost
+    new = total + x
+    return new, (new - total) - x
 
 
 def _distinct(out):
