@@ -23,11 +23,12 @@ def test_the_code_of_the_readme_runs():
     assert (np.asarray(smoothed.cov)[25, 0, 0] < np.asarray(out.cov)[25, 0, 0]).all()
     assert np.isfinite(names["slope"])
     assert names["batch"].shape == (3,)
+    assert names["slopes"].shape == (1000,)
 
 
 def test_the_names_of_the_readme_exist():
     rows = re.findall(
-        r"^\| (?:Filters|Nonlinear|Maneuvers|Association|Lost|Smoothing|Models|Simulation|Tuning).*$",
+        r"^\| (?:Filters|Nonlinear|Maneuvers|Association|Lost|Smoothing|Models|Long|Simulation|Tuning).*$",
         README,
         re.MULTILINE,
     )

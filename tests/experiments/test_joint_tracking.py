@@ -185,7 +185,7 @@ def test_bands(seed):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_exact_posterior_evidence_and_the_printed_recursion(seed):
     """S6, S7."""
-    found = exact.study(jax.random.key(seed), 60, 400)
+    found = exact.study(jax.random.key(seed), 60, 1600)  # of 400 the mean of so skewed a ratio is not yet normal
     assert np.abs(found["sound"].mean(axis=1) - found["exact"]).max() < 0.01
     for floor in exact.FLOORS:
         x = found[f"Z {floor}"]
