@@ -219,8 +219,7 @@ def packed(state: PyTree, info: Info) -> tuple[Array, Array]:
 
 def unpack(triangle: Array) -> Array:
     """Symmetric matrices (..., n, n) from their lower triangles (..., n (n + 1) / 2)."""
-    if not hasattr(triangle, "shape"):
-        triangle = jnp.asarray(numbers("triangle", triangle))
+    triangle = real_array("triangle", triangle)
     n = int(np.sqrt(2 * triangle.shape[-1]))
     if n * (n + 1) // 2 != triangle.shape[-1]:
         raise ValueError(f"triangle: expected n (n + 1) / 2 entries, got {triangle.shape[-1]}")
@@ -392,8 +391,8 @@ def inputs(
     _check_finite(concrete, mask)
     if dt is not None:
         dt = _per_step("dt", dt, T, ys.dtype, ranks=(1,))
-        if is_concrete(dt) and not (np.asarray(dt) >= 0).all():
-            k = int(np.argmin(np.asarray(dt) >= 0))
+        if is_concrete(dt) and not (good := np.isfinite(dt) & (np.asarray(dt) >= 0)).all():
+            k = int(np.argmin(good))
             raise ValueError(f"dt: expected finite intervals >= 0, got dt[{k}] = {float(dt[k])}")
     for leaf in jax.tree.leaves(u):
         if not hasattr(leaf, "dtype"):
@@ -407,6 +406,9 @@ def inputs(
         r_scale = _per_step("r_scale", r_scale, T, ys.dtype, ranks=(1, 2))
     if key is not None:
         check_key(key)
+    for name, scale in (("q_scale", q_scale), ("r_scale", r_scale)):
+        if scale is not None and is_concrete(scale) and not (np.isfinite(scale) & (np.asarray(scale) >= 0)).all():
+            raise ValueError(f"{name}: expected finite factors >= 0, got {np.asarray(scale)}")
     keys = None if key is None else jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(1, T + 1))
     return StepInput(ys, mask, dt, jax.tree.map(jnp.asarray, u), keys, q_scale, r_scale)
 
@@ -529,6 +531,16 @@ def numbers(name: str, x: Any) -> np.ndarray:
     if not any(jnp.issubdtype(a.dtype, kind) for kind in (np.floating, np.integer, np.bool_)):
         raise TypeError(f"{name}: expected real numbers, got {x!r}")
     return a
+
+
+def real_array(name: str, x: Any) -> Array:
+    """``x`` as an array of real numbers, or a TypeError that names it; what is traced is looked at by its dtype."""
+    if not hasattr(x, "dtype") and is_concrete(x):
+        numbers(name, x)
+    x = jnp.asarray(x)
+    if jnp.issubdtype(x.dtype, jnp.complexfloating) or jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        raise TypeError(f"{name}: expected real numbers, got {x.dtype}")
+    return x
 
 
 def number(name: str, x: Any) -> float:

@@ -71,11 +71,13 @@ def fit_ellipse(
         if int(here.sum()) < 6:
             raise ValueError(f"ys: expected at least 6 samples, got {int(here.sum())}")
     here = here & jnp.isfinite(ys).all(axis=1)
-    fit = _fit(ys, here, block, limit, least_coverage)
+    fit = _fit(ys, here, block, jnp.asarray(limit, ys.dtype), jnp.asarray(least_coverage, ys.dtype))
     if is_concrete(fit.status) and int(fit.status) & int(Status.SINGULAR):
         covered = float(fit.coverage)
         if covered < least_coverage:
-            raise ValueError(f"ys: expected samples of {least_coverage:g} of the cycle, got {covered:.3g}")
+            raise ValueError(
+                f"ys: expected samples of {least_coverage:g} of the cycle (least_coverage), got {covered:.3g}"
+            )
         raise ValueError("ys: the best conic is not an ellipse around the origin")
     return fit
 

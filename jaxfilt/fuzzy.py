@@ -245,7 +245,7 @@ def triangles(levels: int = 4, output_range: tuple[float, float] = (0.0, 100.0),
         inner: peaks inside instead, at ``1 / (levels + 1), 2 / (levels + 1), ...`` of the range: nothing is cut.
     """
     check_count("levels", levels, 2)
-    low, high = check_range(output_range)
+    low, high = _check_range(output_range)
     place = np.arange(levels)
     if inner:
         corners = (place[:, None] + np.arange(3)) / (levels + 1)
@@ -254,7 +254,7 @@ def triangles(levels: int = 4, output_range: tuple[float, float] = (0.0, 100.0),
     return low + (high - low) * corners
 
 
-def check_range(output_range: Any) -> tuple[float, float]:
+def _check_range(output_range: Any) -> tuple[float, float]:
     """The ends of the output's universe, or an error that names ``output_range``."""
     ends = numbers("output_range", output_range)
     if ends.shape != (2,) or not (np.isfinite(ends).all() and ends[0] < ends[1]):
@@ -304,7 +304,7 @@ def mamdani(
             raise ValueError(f"corners: expected shape (L, 4) or ({d}, L, 4), got {corners.shape}")
         corners = corners if corners.ndim == 3 else jnp.broadcast_to(corners, (d, *corners.shape))
     _check_inputs(universe, corners)
-    output_range = check_range(output_range)
+    output_range = _check_range(output_range)
     L = corners.shape[1]
     if outputs is None:
         outputs = triangles(L, output_range)

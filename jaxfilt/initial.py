@@ -12,7 +12,14 @@ from jax import Array
 from jaxfilt.core import PyTree, Status, StepInput, flag, inputs
 from jaxfilt.linalg import chol, solve_chol, solve_lower
 from jaxfilt.metrics.cramer_rao import condition, inverse_information
-from jaxfilt.models.linear import LinearGaussian, check_covariance, check_positive
+from jaxfilt.models.linear import (
+    LinearGaussian,
+    check_covariance,
+    check_finite,
+    check_positive,
+    check_shape,
+    common_dtype,
+)
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear
 from jaxfilt.noise_free import noise_free
 from jaxfilt.wrappers.common import check_count
@@ -92,14 +99,20 @@ def batch_ml(
     Source: Levenberg 1944; Marquardt 1963.
     """
     check_count("iterations", iterations, 1)
-    check_positive("damping", damping)
+    check_positive("damping", damping, scalar=True)
     model = as_nonlinear(model)
     dtype = model.m0.dtype
     n = model.m0.shape[0]
+    common_dtype({"starts": starts, "m0": model.m0})
+    check_finite("starts", starts)
     starts = jnp.asarray(starts, dtype)
     if starts.ndim != 2 or starts.shape[1] != n or starts.shape[0] == 0:
         raise ValueError(f"starts: expected shape (S, {n}), got {starts.shape}")
     if prior is not None:
+        if not isinstance(prior, tuple | list) or len(prior) != 2:
+            raise ValueError(f"prior: expected (m, P), got {prior!r}")
+        common_dtype({"prior": tuple(prior), "m0": model.m0})
+        check_finite("prior", prior[0])
         mean, P = (jnp.asarray(x, dtype) for x in prior)
         if mean.shape != (n,) or P.shape != (n, n):
             raise ValueError(f"prior: expected shapes ({n},) and ({n}, {n}), got {mean.shape} and {P.shape}")
@@ -107,10 +120,15 @@ def batch_ml(
         prior = (mean, chol(P))
     if scale is not None:
         check_positive("scale", scale)
+        if jnp.shape(scale) not in ((), (n,)):
+            raise ValueError(f"scale: expected shape ({n},), got {jnp.shape(scale)}")
         scale = jnp.broadcast_to(jnp.asarray(scale, dtype), (n,))
     stacked = inputs(ys, u=u, dt=dt, mask=mask)
     if stacked.y.dtype != dtype:
         raise TypeError(f"ys: is {stacked.y.dtype}, but the model is {dtype}; convert one of them")
+    u0, dt0 = jax.tree.map(lambda leaf: leaf[0], (stacked.u, stacked.dt))
+    if (m := jax.eval_shape(model.h, model.m0, u0, dt0).shape) != stacked.y.shape[1:]:
+        raise ValueError(f"ys: expected shape (T, m) as h gives {m}, got {stacked.y.shape}")
     options = jnp.asarray(damping, dtype), scale
     return _search(model, stacked, starts, prior, options, iterations, first_update_only)
 
@@ -123,6 +141,13 @@ def cost(
 
     ``prior`` is ``(m, P)``. Differentiable in x0 and in the model.
     """
+    model = as_nonlinear(model)
+    if not isinstance(stacked, StepInput):
+        raise TypeError(f"stacked: expected a StepInput, got {type(stacked).__name__}")
+    common_dtype({"x0": x0, "m0": model.m0})
+    check_shape("x0", x0, model.m0.shape)
+    if prior is not None and (not isinstance(prior, tuple | list) or len(prior) != 2):
+        raise ValueError(f"prior: expected (m, P), got {prior!r}")
     prior = None if prior is None else (prior[0], chol(prior[1]))
     return _normal(model, x0, stacked, prior, first_update_only)[0]
 

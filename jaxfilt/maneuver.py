@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.chi2 import chi2_quantile
-from jaxfilt.core import Info, Status, check_count, check_float, number
+from jaxfilt.core import Info, Status, check_count, check_float, is_concrete, number, real_array
 from jaxfilt.filters.common import decoupled
 from jaxfilt.linalg import chol, solve_lower, sym
 
@@ -184,11 +184,14 @@ def cumulative(nis: Any, mask: Any = None, *, m: int = 1) -> Cumulative:
     check_float("nis", nis)
     check_count("m", m, 1)
     nis = jnp.asarray(nis)
-    if mask is not None and getattr(mask, "dtype", None) != np.dtype(bool):
-        raise TypeError(f"mask: expected a bool array, got {getattr(mask, 'dtype', type(mask).__name__)}")
-    if nis.ndim == 0 or (mask is not None and (np.ndim(mask) < 2 or mask.shape[-2] != nis.shape[-1])):
-        raise ValueError(f"nis, mask: expected shapes (..., T) and (..., T, m), got {nis.shape} and {np.shape(mask)}")
-    counts = jnp.full(nis.shape, m) if mask is None else jnp.asarray(mask).sum(axis=-1)
+    mask = jnp.ones((*nis.shape[-1:], m), bool) if mask is None else real_array("mask", mask)
+    if mask.dtype != np.dtype(bool):
+        raise TypeError(f"mask: expected bool, got {mask.dtype}")
+    if is_concrete(nis) and (np.asarray(nis) < 0).any():
+        raise ValueError(f"nis: expected values >= 0, got {np.asarray(nis).min()}")
+    if nis.ndim == 0 or mask.ndim < 2 or mask.shape[:-1] not in (nis.shape, nis.shape[-1:]):
+        raise ValueError(f"nis, mask: expected shapes (..., T) and (..., T, m), got {nis.shape} and {mask.shape}")
+    counts = mask.sum(axis=-1)
     dof = jnp.broadcast_to(jnp.cumsum(counts, axis=-1), nis.shape)
     statistic = jnp.cumsum(nis, axis=-1)
     p_value = jax.scipy.special.gammaincc(0.5 * jnp.maximum(dof, 1).astype(nis.dtype), 0.5 * statistic)

@@ -26,7 +26,7 @@ from jaxfilt.checkpoint import Store, stored_chunk
 from jaxfilt.core import Filter, PyTree, Static, Status, aspartial
 from jaxfilt.linalg import structure
 from jaxfilt.metrics import Estimate
-from jaxfilt.models.linear import LinearGaussian
+from jaxfilt.models.linear import LinearGaussian, check_linear
 from jaxfilt.simulate import simulate
 
 # More runs in one call cost memory and save nothing: from 256 to 16384 the processor time per run is the same.
@@ -118,6 +118,8 @@ def scenario(
         u: pytree with leading T, for simulation and filters.
         first_update_only: the start is at the first sample, for simulation and filters.
     """
+    check_linear(model)
+    core.check_count("T", T, 1)
     shared = core.inputs(np.zeros((T, 1), model.m0.dtype), dt=dt, u=u)
     draw = Partial(_draw_from_model, model, Static((T, first_update_only)), shared.dt, shared.u)
     return Scenario(draw, mask, shared.dt, shared.u, first_update_only)
@@ -175,15 +177,23 @@ def monte_carlo(
         ImportError: ``progress`` without tqdm.
     """
     _check_count("runs", runs)
+    core.check_key(key)
+    if not core.number("memory_limit", memory_limit) > 0:
+        raise ValueError(f"memory_limit: expected bytes > 0, got {memory_limit}")
+    core.check_callable("outputs", outputs)
+    if not isinstance(scenario, Scenario):
+        raise TypeError(f"scenario: expected a Scenario, got {type(scenario).__name__}")
+    if not isinstance(filters, Mapping) or not filters:
+        raise ValueError(f"filters: expected at least one, in a dict, got {type(filters).__name__}")
     filters = dict(filters)
-    if not filters:
-        raise ValueError("filters: expected at least one")
+    for name, filt in filters.items():
+        core.check_filter(filt, f"filters[{name!r}]")
     tqdm = _import_tqdm() if progress else None
     devices = tuple(jax.local_devices() if devices is None else devices)
 
     started = time.perf_counter()
     static = Static((scenario.first_update_only, outputs, structure.of(filters)))
-    job = (aspartial(scenario.simulate), _checked_inputs(scenario, key), filters, aspartial(score), key)
+    job = (aspartial(scenario.simulate), _checked_inputs(scenario, key), filters, aspartial(score, "score"), key)
     bytes_per_run = _check_and_size(job, static)
     if chunk is None and checkpoint is not None:
         chunk = stored_chunk(checkpoint)

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import check_count, check_float, is_concrete, mask_nan, number, numbers
+from jaxfilt.core import check_count, check_float, is_concrete, mask_nan, number, numbers, real_array
 from jaxfilt.models.linear import check_finite, check_positive, check_shape
 from jaxfilt.models.sensors import wrap
 
@@ -118,7 +118,9 @@ def arctan(
     if parameters is not None:
         check_parameters(parameters)
     here = jnp.isfinite(ys) & both_present(ys, mask)[:, None]
-    out, steps = _arctan(ys, here, Parameters() if parameters is None else parameters, floor, counts)
+    out, steps = _arctan(
+        ys, here, Parameters() if parameters is None else parameters, jnp.asarray(floor, ys.dtype), counts
+    )
     if is_concrete((steps, out.usable)):
         _check_rate(np.asarray(steps), np.asarray(out.usable))
     return out
@@ -174,6 +176,7 @@ def mask_clipped(ys: Any, low: float, high: float) -> tuple[Array, Array]:
     Raises:
         ValueError: unless ``low < high``.
     """
+    check_float("ys", ys)
     low, high = number("low", low), number("high", high)
     if not low < high:
         raise ValueError(f"low: expected low < high, got {low} and {high}")
@@ -193,6 +196,7 @@ def mechanical(theta: Any, cycles: int) -> Any:
     Raises:
         ValueError: ``cycles`` is no positive integer.
     """
+    real_array("theta", theta)
     if isinstance(cycles, bool) or not isinstance(cycles, int) or cycles < 1:
         raise ValueError(f"cycles: expected a positive integer, got {cycles!r}")
     return theta / cycles
@@ -214,12 +218,17 @@ def calibrated(mean: Array, cov: Array, prior: Any, *, share: float = 0.1) -> Ar
     for name, x, shape in (("mean", mean, (None, 8)), ("cov", cov, (None, 8, 8)), ("prior", prior, (8, 8))):
         check_float(name, x)
         check_shape(name, x, shape)
-    check_positive("share", share)
+    check_positive("share", share, scalar=True)
+    check_finite("prior", prior)
     covered = jax.lax.cummax(mean[:, 0]) - jax.lax.cummin(mean[:, 0]) >= 2 * np.pi
     index = np.array([2, 3, 5, 6])
     before = jnp.diagonal(jnp.asarray(prior, cov.dtype))[index]
     now = jnp.diagonal(cov, axis1=1, axis2=2)[:, index]
-    return covered & (now < share**2 * before[None, :]).all(axis=1)
+    return (
+        covered
+        & jnp.isfinite(mean).all(axis=1)
+        & (now < jnp.asarray(share, cov.dtype) ** 2 * before[None, :]).all(axis=1)
+    )
 
 
 # ------------------------------------------------------------------------------------------ losses, for any optimizer

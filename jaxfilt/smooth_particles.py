@@ -70,6 +70,8 @@ def smooth_particles(
 
     Source: Doucet, Godsill and Andrieu 2000; Godsill, Doucet and West 2004; Bunch and Godsill 2013.
     """
+    if not isinstance(out, Info):
+        raise TypeError(f"out: expected the Info that jf.filter returns, got {type(out).__name__}")
     lacking = [name for name in ("particles", "log_weights", "ancestors") if name not in out.extra]
     if lacking:
         raise ValueError(f"out: has no {', '.join(lacking)}; filter with jf.particle(..., keep=True)")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, StepInput, bind, flag, is_concrete, present
+from jaxfilt.core import Filter, Info, Prediction, Static, Status, StepInput, bind, flag, is_concrete, numbers, present
 from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, innovate, likelihood
 from jaxfilt.filters.gains import check_stable, growing_memory, is_stable, to_kappa
 from jaxfilt.linalg import chol, scale_cov, solve_lower, sym
@@ -114,6 +114,8 @@ def alpha_beta_gamma(
     if isinstance(gamma, list | tuple):
         gamma = tuple(to_kappa(g, convention) for g in gamma)
     else:
+        if is_concrete(gamma):
+            numbers("gamma", gamma)
         gamma = to_kappa(gamma, convention)
     return _fixed_gain((alpha, beta, gamma), dt, r, m0, start)
 
@@ -128,13 +130,14 @@ def _fixed_gain(gains, dt, r, m0, start):
     if start == "two_point" and m0 is not None:
         raise ValueError('m0: start="two_point" takes the state from the measurements; give one of them')
     p = _Params(tuple(_floats(g) for g in gains), _floats(dt), _floats(r), _floats(m0), Static(start))
-    common_dtype({**dict(zip(_NAMES, p.gains, strict=False)), "dt": p.dt, "r": p.r, "m0": p.m0})
+    optional = {name: x for name, x in (("r", p.r), ("m0", p.m0)) if x is not None}
+    common_dtype({**dict(zip(_NAMES, p.gains, strict=False)), "dt": p.dt, **optional})
     check_positive("dt", p.dt)
     for name, gain in zip(_NAMES, p.gains, strict=False):
         if len(_shape(gain)) > 1 or 0 in _shape(gain):
             raise ValueError(f"{name}: expected a scalar or one gain per measurement (K,), got shape {_shape(gain)}")
         check_finite(name, gain)
-    check_stable(*(_last(g) for g in p.gains))
+    check_stable(*(_last(g) for g in p.gains), third="kappa of gamma")
     if len(_shape(p.dt)) > 0:
         raise ValueError(f"dt: expected a scalar, got shape {_shape(p.dt)}; per step, use jf.filter(..., dt=)")
     if len(_shape(p.r)) > 2 or len(set(_shape(p.r))) > 1:

@@ -21,7 +21,7 @@ from jaxfilt.core import (
     check_count,
     flag,
     is_concrete,
-    numbers,
+    number,
 )
 from jaxfilt.filters.common import innovate, likelihood
 from jaxfilt.filters.kalman import init_mean, input_term
@@ -180,9 +180,8 @@ def adaptive_delayed_kalman(
 
     Source: Nikfetrat, Mahboobi Esfanjani and Azimi 2017, eqs. (22) to (38), corrected.
     """
-    if forgetting is None:
-        check_count("window", window, 1)
-    elif is_concrete(forgetting) and not 0 <= float(numbers("forgetting", forgetting)) < 1:
+    check_count("window", window, 1)
+    if forgetting is not None and is_concrete(forgetting) and not 0 <= number("forgetting", forgetting) < 1:
         raise ValueError(f"forgetting: expected a value in [0, 1), got {forgetting}")
     if not hasattr(bounds, "__len__") or len(bounds) != 2:
         raise ValueError(f"bounds: expected (smallest, largest), got {bounds}")

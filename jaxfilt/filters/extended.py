@@ -98,7 +98,7 @@ def init_mean(model: Nonlinear, inp: StepInput) -> Array:
 
 
 def _params(model, order, iterations, relinearize):
-    if order not in (1, 2):
+    if not isinstance(order, int) or order not in (1, 2):
         raise ValueError(f"order: expected 1 or 2, got {order!r}")
     if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
         raise ValueError(f"iterations: expected an int >= 1, got {iterations!r}")

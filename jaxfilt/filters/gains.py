@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import is_concrete
+from jaxfilt.core import is_concrete, numbers
 
 Pair = tuple[Any, Any]
 Triple = tuple[Any, Any, Any]
@@ -45,11 +45,13 @@ def to_kappa(gamma: Any, convention: str) -> Any:
     Raises:
         ValueError: unknown convention.
     """
+    _numbers("gamma", gamma)
     return gamma * _option("convention", convention, _CONVENTIONS)
 
 
 def from_kappa(kappa: Any, convention: str) -> Any:
     """The gamma of a convention that has the acceleration gain kappa; the inverse of :func:`to_kappa`."""
+    _numbers("kappa", kappa)
     return kappa / _option("convention", convention, _CONVENTIONS)
 
 
@@ -81,6 +83,7 @@ def simpson(alpha: Any, beta: Any) -> Triple:
     Source: Simpson 1963; Neal 1967; thesis, eq. (2-50).
     """
     _require("alpha", alpha, lambda x: (x > 0) & (x < 2), "in (0, 2)")
+    _require("beta", beta, np.isfinite, "finite values")
     return alpha, beta, 2 * beta * (2 - alpha) / alpha - 2 * alpha
 
 
@@ -219,6 +222,8 @@ def is_stable(alpha: Any, beta: Any, kappa: Any = None) -> Any:
 
     Source: Jury 1964; thesis, eq. (2-23) corrected (its bound on beta is missing).
     """
+    for name, x in (("alpha", alpha), ("beta", beta), ("kappa", 0.0 if kappa is None else kappa)):
+        _numbers(name, x)
     stable = (alpha > 0) & (alpha < 2) & (beta > 0) & (beta < 4 - 2 * alpha)
     return stable if kappa is None else stable & (kappa > 0) & (2 * alpha * beta > kappa * (2 - alpha))
 
@@ -278,6 +283,7 @@ def steady_lag(alpha: Any, beta: Any, kappa: Any = None, *, dt: Any, rate: Any =
     Source: Sklansky 1957; order 2 is ours.
     """
     _positive("dt", dt)
+    _require("rate", rate, np.isfinite, "finite values")
     check_stable(alpha, beta, kappa)
     if kappa is None:
         predicted = rate * dt * dt / beta
@@ -293,6 +299,9 @@ def from_unconstrained(a: Any, b: Any, c: Any = None) -> tuple[Array, ...]:
     ``alpha = 2 sigmoid(a)``, ``beta = (4 - 2 alpha) sigmoid(b)``, and for order 2
     ``kappa = 2 alpha beta / (2 - alpha) sigmoid(c)``.
     """
+    for name, x in (("a", a), ("b", b), ("c", 0.0 if c is None else c)):
+        _numbers(name, x)
+    a, b, c = (x if x is None or jnp.issubdtype(jnp.result_type(x), jnp.floating) else x * 1.0 for x in (a, b, c))
     alpha = 2 * jax.nn.sigmoid(a)
     rest = 2 * jax.nn.sigmoid(-jnp.asarray(a))  # 2 - alpha, without its cancellation
     beta = 2 * rest * jax.nn.sigmoid(b)
@@ -331,13 +340,13 @@ def _scaled_covariance(alpha, beta, kappa, dt):
     return [[xx, xv, xa], [xv, vv, va], [xa, va, 4 * beta * kappa * kappa / d]]
 
 
-def check_stable(alpha, beta, kappa=None):
+def check_stable(alpha, beta, kappa=None, *, third="kappa"):
     """Raises a ValueError if concrete gains are not stable."""
-    names = "alpha, beta" if kappa is None else "alpha, beta, kappa"
-    given = [x for x in (alpha, beta, kappa) if x is not None]
+    names = "alpha, beta" if kappa is None else f"alpha, beta, {third}"
+    given = [alpha, beta] if kappa is None else [alpha, beta, kappa]
     if is_concrete(given):
         # NumPy on purpose: inside a transformation JAX would trace even what is concrete.
-        values = [np.asarray(x) for x in given]
+        values = [numbers(name, x) for name, x in zip(names.split(", "), given, strict=True)]
         if not np.all(is_stable(*values)):
             region = "0 < alpha < 2, 0 < beta < 4 - 2 alpha"
             if kappa is not None:
@@ -347,8 +356,13 @@ def check_stable(alpha, beta, kappa=None):
 
 
 def _require(name: str, x: Any, valid: Callable[[np.ndarray], Any], expected: str) -> None:
-    if is_concrete(x) and not np.all(valid(np.asarray(x))):
+    if is_concrete(x) and not np.all(valid(numbers(name, x))):
         raise ValueError(f"{name}: expected {expected}, got {np.asarray(x)}")
+
+
+def _numbers(name, x):
+    if is_concrete(x):
+        numbers(name, x)
 
 
 def _positive(name, x):
@@ -356,12 +370,12 @@ def _positive(name, x):
 
 
 def _order(order):
-    if order not in (1, 2):
+    if not isinstance(order, int) or order not in (1, 2):
         raise ValueError(f"order: expected 1 (line) or 2 (parabola), got {order!r}")
     return order
 
 
 def _option(name, value, options):
-    if value not in options:
+    if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
     return options[value]

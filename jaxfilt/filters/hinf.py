@@ -21,6 +21,7 @@ from jaxfilt.models.linear import (
     check_linear,
     check_positive,
     check_shape,
+    common_dtype,
     value,
 )
 
@@ -201,6 +202,8 @@ def riccati(model: LinearGaussian, theta: Any = 0.0, *, weight: Any = None, doub
     """
     F, H, Q, R, _ = _matrices(model)
     check_theta("theta", theta)
+    check_shape("theta", theta, ())
+    common_dtype({"theta": theta, "m0": model.m0})
     check_count("doublings", doublings, 0)
     S = _weight(weight, F.shape[0], F.dtype)
     return _solve(F, H, Q, R, theta * theta, S, doublings)
@@ -208,7 +211,7 @@ def riccati(model: LinearGaussian, theta: Any = 0.0, *, weight: Any = None, doub
 
 def check_theta(name: str, theta: Any) -> None:
     """Raises a ValueError that names ``theta`` if it is concrete and negative or not finite."""
-    check_positive(name, theta, zero=True)
+    check_positive(name, theta, zero=True, scalar=True)
 
 
 def _make(model, theta2, weight, stationary, output, infeasible, square_root):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, PyTree, Static, Status, StepInput, bind, flag, is_concrete
+from jaxfilt.core import (
+    Filter,
+    Info,
+    Prediction,
+    PyTree,
+    Static,
+    Status,
+    StepInput,
+    bind,
+    flag,
+    is_concrete,
+    real_array,
+)
 from jaxfilt.filters.common import decoupled, likelihood
 from jaxfilt.linalg import chol, solve_chol, solve_lower, sym
 from jaxfilt.models.linear import common_dtype
@@ -119,7 +132,7 @@ def imm(
 
 
 def _check_probabilities(name, x, shape):
-    got = jnp.asarray(x)
+    got = real_array(name, x)
     if got.shape != shape:
         raise ValueError(f"{name}: expected shape {shape} for {shape[0]} filters, got {got.shape}")
     if not is_concrete(x):
@@ -133,7 +146,10 @@ def _check_probabilities(name, x, shape):
 
 
 def _check_index(index, r):
-    index = tuple(tuple(int(i) for i in positions) for positions in index)
+    try:
+        index = tuple(tuple(operator.index(i) for i in positions) for positions in index)
+    except TypeError:
+        raise TypeError(f"index: expected positions for each filter, got {index!r}") from None
     if len(index) != r:
         raise ValueError(f"index: expected positions for {r} filters, got {len(index)}")
     for j, positions in enumerate(index):

@@ -102,6 +102,8 @@ def interval_observer(
     check_shape("A_low", a["A_low"], (None, None))
     check_shape("C", a["C"], (None, None))
     n, m = a["A_low"].shape[0], a["C"].shape[0]
+    if n == 0:
+        raise ValueError(f"A_low: expected shape (n, n) with n >= 1, got {a['A_low'].shape}")
     for name, shape in {"A_low": (n, n), "A_high": (n, n), "C": (m, n), "L": (n, m)}.items():
         check_shape(name, a[name], shape)
     for name, size in (("w_low", n), ("w_high", n), ("v_bound", m), ("x_low", n), ("x_high", n)):

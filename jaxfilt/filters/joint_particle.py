@@ -11,7 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, aspartial, bind, flag, is_concrete
+from jaxfilt.core import (
+    Filter,
+    Info,
+    Prediction,
+    Static,
+    Status,
+    aspartial,
+    bind,
+    flag,
+    is_concrete,
+    number,
+    real_array,
+)
+from jaxfilt.core import check_count as core_check_count
 from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood, stack, step_key
 from jaxfilt.filters.imm import _check_probabilities, _log_probabilities
 from jaxfilt.filters.particle import check_count, check_share
@@ -144,12 +157,12 @@ def joint_particle(
     ):
         if option not in known:
             raise ValueError(f"{name}: expected one of {', '.join(known)}, got {option!r}")
-    if is_concrete(floor) and not 0 < float(floor) <= 1:
+    if is_concrete(floor) and not 0 < number("floor", floor) <= 1:
         raise ValueError(f"floor: expected 0 < floor <= 1, got {floor}; a class without particles never comes back")
     if is_concrete(floor) and np.floor(float(floor) * count / s) < 1:
         raise ValueError(f"floor: {floor} of {count} particles leaves a class without any")
     check_share("threshold", threshold)
-    transition_shape = (s, M, M) if jnp.asarray(transition).ndim == 3 else (M, M)
+    transition_shape = (s, M, M) if real_array("transition", transition).ndim == 3 else (M, M)
     prior = (1 / s,) * s if prior is None else prior
     mode_prior = (1 / M,) * M if mode_prior is None else mode_prior
     _check_probabilities("transition", transition, transition_shape)
@@ -206,7 +219,9 @@ def _as_models(models) -> tuple[tuple[Nonlinear, ...], ...]:
 
 def _check_noise(models, rank):
     n = models[0][0].m0.shape[0]
-    if rank is not None and not 1 <= rank <= n:
+    if rank is not None:
+        core_check_count("noise_rank", rank, 1)
+    if rank is not None and rank > n:
         raise ValueError(f"noise_rank: expected 1 to {n}, got {rank}")
     for row in models:
         for model in row:

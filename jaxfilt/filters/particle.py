@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, flag
+from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, check_callable, check_filter, flag
 from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood, step_key
 from jaxfilt.filters.resampling import (
     SCHEMES,
@@ -140,11 +140,15 @@ def particle(
         raise ValueError(f"gradient: {gradient!r} is another way to resample than auxiliary's")
     check_share("threshold", threshold)
     check_share("alpha", alpha)
-    check_positive("alpha", alpha)
-    check_positive("epsilon", epsilon)
+    check_positive("alpha", alpha, scalar=True)
+    check_positive("epsilon", epsilon, scalar=True)
     model = as_nonlinear(model)
     options = _Options(count, resampling, auxiliary, gradient, sweeps, keep)
+    if guide is not None:
+        check_callable("guide", guide)
     inner = None if guide is None else guide(model)
+    if inner is not None:
+        check_filter(inner, "guide")
     if inner is not None and (inner.moments is None or inner.with_moments is None):
         raise ValueError("guide: needs a filter with moments and with_moments")
     params = _Params(model, inner, threshold, alpha, epsilon, Static(options))
@@ -159,7 +163,7 @@ def check_count(name: str, count: Any, of: str) -> None:
 
 def check_share(name: str, share: Any) -> None:
     """Raises a ValueError if ``share`` is concrete and not in [0, 1]."""
-    check_positive(name, share, zero=True)
+    check_positive(name, share, zero=True, scalar=True)
     check_positive(f"1 - {name}", 1 - jnp.asarray(share), zero=True)
 
 

@@ -13,7 +13,7 @@ from jaxfilt.core import Filter, Prediction, Static, Status, bind, flag, is_conc
 from jaxfilt.filters.extended import init_mean
 from jaxfilt.filters.update import array_update, factor_update
 from jaxfilt.linalg import chol, mirror, scale_cov, solve_lower, sym, tria
-from jaxfilt.models.linear import LinearGaussian, check_finite, check_positive, common_dtype
+from jaxfilt.models.linear import LinearGaussian, check_finite, check_positive, check_shape, common_dtype
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance
 
 
@@ -115,6 +115,8 @@ def _params(model, alpha, beta, kappa):
     n = model.m0.shape[0]
     common_dtype({"alpha": alpha, "beta": beta, "kappa": kappa, "m0": model.m0})
     downdates = True
+    for name, x in (("alpha", alpha), ("beta", beta), ("kappa", kappa)):
+        check_shape(name, x, ())
     check_positive("alpha", alpha)
     check_finite("beta", beta)
     check_finite("kappa", kappa)

@@ -184,7 +184,7 @@ def _expand(x, plan, aval, steps):
     for entry in plan:
         if is_known(entry):
             value = entry * steps if jnp.issubdtype(aval.dtype, jnp.inexact) else entry
-            columns.append(jnp.full(x.shape[:-1], value, aval.dtype))
+            columns.append(jnp.broadcast_to(jnp.asarray(value, aval.dtype), x.shape[:-1]))
         else:
             columns.append(x[..., entry])
     return jnp.stack(columns, axis=-1).reshape(*x.shape[:-1], *aval.shape)

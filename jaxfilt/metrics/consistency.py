@@ -15,7 +15,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxfilt.chi2 import chi2_quantile
+from jaxfilt.core import check_count, check_float, number, numbers, real_array
 from jaxfilt.linalg import chol, solve_lower
+from jaxfilt.metrics.errors import check_components
+from jaxfilt.models.linear import check_finite, common_dtype
 
 
 class Consistency(NamedTuple):
@@ -53,14 +56,15 @@ def nees(mean: ArrayLike, cov: ArrayLike, truth: ArrayLike, *, components: Seque
     Raises:
         ValueError: shapes that do not fit.
     """
+    common_dtype({"mean": mean, "cov": cov, "truth": truth})
     mean, cov, truth = jnp.asarray(mean), jnp.asarray(cov), jnp.asarray(truth)
-    if mean.shape != truth.shape or cov.shape != (*mean.shape, *mean.shape[-1:]):
+    if mean.ndim == 0 or mean.shape != truth.shape or cov.shape != (*mean.shape, *mean.shape[-1:]):
         raise ValueError(
             f"expected mean (..., n), cov (..., n, n), truth (..., n); got {mean.shape}, {cov.shape}, {truth.shape}"
         )
     error = truth - mean
     if components is not None:
-        picked = np.asarray(components, np.int32)
+        picked = check_components(components, mean.shape[-1])
         error, cov = error[..., picked], cov[..., picked, :][..., picked]
     one = _mahalanobis
     for _ in range(error.ndim - 1):
@@ -70,7 +74,8 @@ def nees(mean: ArrayLike, cov: ArrayLike, truth: ArrayLike, *, components: Seque
 
 def _mahalanobis(error, cov):
     whitened = solve_lower(chol(cov), error)
-    return jnp.sum(whitened * whitened)
+    # A covariance that is not finite has a factor of zeros: it must not look like one without any variance.
+    return jnp.where(jnp.isfinite(cov).all(), jnp.sum(whitened * whitened), jnp.asarray(np.nan, cov.dtype))
 
 
 def chi2_region(dof: float, runs: int, probability: float = 0.999) -> tuple[float, float]:
@@ -87,13 +92,16 @@ def chi2_region(dof: float, runs: int, probability: float = 0.999) -> tuple[floa
     Raises:
         ValueError: values out of range.
     """
-    if runs < 1:
-        raise ValueError(f"runs: expected at least 1, got {runs}")
+    check_count("runs", runs, 1)
+    dof = number("dof", dof)
+    if not dof > 0:
+        raise ValueError(f"dof: expected a value > 0, got {dof}")
     low, high = _tails(probability)
     return chi2_quantile(low, dof * runs) / runs, chi2_quantile(high, dof * runs) / runs
 
 
 def _tails(probability):
+    probability = number("probability", probability)
     if not 0 < probability < 1:
         raise ValueError(f"probability: expected a value in (0, 1), got {probability}")
     return 0.5 * (1 - probability), 0.5 * (1 + probability)
@@ -115,7 +123,7 @@ def consistency(values: Any, dof: Any, *, probability: float = 0.999) -> Consist
     Raises:
         ValueError: no values, or dof of another shape or 0 in total.
     """
-    values, dof = np.asarray(values, np.float64), np.asarray(dof, np.float64)
+    values, dof = (numbers(name, x).astype(np.float64) for name, x in (("values", values), ("dof", dof)))
     if values.ndim == 0 or values.shape[0] == 0:
         raise ValueError(f"values: expected shape (N, ...) with N >= 1, got {values.shape}")
     if dof.shape not in ((), values.shape):
@@ -154,12 +162,19 @@ def whiteness(
     Raises:
         ValueError: fewer than lags + 1 samples.
     """
+    check_count("lags", lags, 1)
+    check_float("innovations", innovations)
     nu = jnp.asarray(innovations)
     if nu.ndim < 2 or not 1 <= lags < nu.shape[-2]:
         raise ValueError(f"innovations: expected shape (..., T, m) with T > lags = {lags}, got {nu.shape}")
-    present = jnp.ones(nu.shape, bool) if mask is None else jnp.broadcast_to(jnp.asarray(mask), nu.shape)
     if innovation_cov is not None:
-        S = jnp.broadcast_to(jnp.asarray(innovation_cov), (*nu.shape, nu.shape[-1]))
+        check_finite("innovation_cov", innovation_cov)
+    present = jnp.ones(nu.shape, bool) if mask is None else _whole("mask", mask, nu.shape)
+    if present.dtype != np.dtype(bool):
+        raise TypeError(f"mask: expected bool, got {present.dtype}")
+    if innovation_cov is not None:
+        common_dtype({"innovations": innovations, "innovation_cov": innovation_cov})
+        S = _whole("innovation_cov", innovation_cov, (*nu.shape, nu.shape[-1]))
         whiten = _whiten
         for _ in range(nu.ndim - 1):
             whiten = jax.vmap(whiten)
@@ -171,6 +186,13 @@ def whiteness(
     r = jnp.stack([jnp.sum(nu[..., :-lag, :] * nu[..., lag:, :], axis=axes) / power for lag in range(1, lags + 1)])
     bound = 3.3 / jnp.sqrt(jnp.maximum(present.sum(axis=axes), 1).astype(nu.dtype))
     return Whiteness(r, bound, jnp.abs(r) <= bound[None, :])
+
+
+def _whole(name, x, shape):
+    x = real_array(name, x)
+    if x.shape != shape[len(shape) - x.ndim :]:
+        raise ValueError(f"{name}: expected shape {shape} as innovations, or its last axes, got {x.shape}")
+    return jnp.broadcast_to(x, shape)
 
 
 def _whiten(nu, S, present):

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import PyTree, inputs
+from jaxfilt.core import PyTree, check_count, inputs
 from jaxfilt.linalg import chol, solve_chol, solve_lower, sym, tria
-from jaxfilt.models.linear import LinearGaussian, check_covariance
+from jaxfilt.models.linear import LinearGaussian, check_covariance, check_finite, check_shape, common_dtype
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance, jacobian
 from jaxfilt.noise_free import noise_free, weighted
 
@@ -65,12 +65,15 @@ def posterior_bound(
         ValueError: wrong shapes, a (concrete) P0 that is no covariance.
     """
     model = as_nonlinear(model)
+    common_dtype({"states": states, "m0": model.m0, "P0": 0.0 if P0 is None else P0})
+    check_finite("states", states)
     states = jnp.asarray(states, model.m0.dtype)
     states = states[None] if states.ndim == 2 else states
     n = model.m0.shape[0]
     if states.ndim != 3 or states.shape[-1] != n or states.shape[1] < 2 - first_update_only:
         raise ValueError(f"states: expected shape (draws, T + 1, {n}) or (T + 1, {n}), got {states.shape}")
     P0 = model.P0 if P0 is None else jnp.asarray(P0, model.m0.dtype)
+    check_shape("P0", P0, (n, n))
     check_covariance("P0", P0)
     after = states if first_update_only else states[:, 1:]
     before = jnp.concatenate([states[:, :1], states[:, :-1]], axis=1) if first_update_only else states[:, :-1]
@@ -113,11 +116,15 @@ def start_bound(
         ValueError: wrong shapes, a (concrete) prior that is no covariance.
     """
     model = as_nonlinear(model)
+    common_dtype({"x0": x0, "m0": model.m0, "prior": 0.0 if prior is None else prior})
+    check_count("steps", steps, 1)
+    check_finite("x0", x0)
     x0 = jnp.asarray(x0, model.m0.dtype)
     if x0.shape != model.m0.shape:
         raise ValueError(f"x0: expected shape {model.m0.shape}, got {x0.shape}")
     if prior is not None:
         prior = jnp.asarray(prior, x0.dtype)
+        check_shape("prior", prior, (*x0.shape, *x0.shape))
         check_covariance("prior", prior)
     return _start(model, x0, _inputs(model, steps, u, dt, mask), prior, first_update_only)
 
@@ -148,6 +155,7 @@ def _unit_diagonal(J):
 
 
 def _inputs(model, T, u, dt, mask):
+    inputs(jnp.zeros((T, 1), model.m0.dtype), u=u, dt=dt)  # refuses these by name before the model sees them
     m = jax.eval_shape(model.h, model.m0, *_first(u, dt, model.m0.dtype)).shape[0]
     return inputs(jnp.zeros((T, m), model.m0.dtype), u=u, dt=dt, mask=mask)
 

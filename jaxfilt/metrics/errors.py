@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxfilt.core import is_concrete
+from jaxfilt.core import is_concrete, numbers, real_array
 
 Components = Sequence[int] | slice | None
 
@@ -29,9 +29,12 @@ def squared_error(estimate: ArrayLike, truth: ArrayLike, *, components: Componen
     Raises:
         ValueError: different shapes.
     """
+    estimate, truth = real_array("estimate", estimate), real_array("truth", truth)
+    if estimate.ndim == 0 or estimate.dtype != truth.dtype:
+        raise TypeError(f"estimate, truth: expected arrays of one dtype, got {estimate.dtype} and {truth.dtype}")
     if jnp.shape(estimate) != jnp.shape(truth):
         raise ValueError(f"estimate: expected the shape of truth {jnp.shape(truth)}, got {jnp.shape(estimate)}")
-    error = _pick(jnp.asarray(estimate), components) - _pick(jnp.asarray(truth), components)
+    error = _pick(estimate, components) - _pick(truth, components)
     return jnp.sum(error * error, axis=-1)
 
 
@@ -63,10 +66,9 @@ def mse(estimate: ArrayLike, truth: ArrayLike, *, components: Components = None,
         if not 0 <= first <= last < T:
             raise ValueError(f"window: expected 0 <= first <= last < {T}, got ({first}, {last})")
         return jnp.mean(errors[..., first : last + 1], axis=-1)
-    if jnp.shape(window) != (T,) or window.dtype != np.dtype(bool):
-        raise ValueError(
-            f"window: expected (first, last) or a bool mask ({T},), got {window.dtype} {jnp.shape(window)}"
-        )
+    window = real_array("window", window)
+    if window.shape != (T,) or window.dtype != np.dtype(bool):
+        raise ValueError(f"window: expected (first, last) or a bool mask ({T},), got {window.dtype} {window.shape}")
     if is_concrete(window) and not np.asarray(window).any():
         raise ValueError("window: the mask counts no sample")
     window = jnp.asarray(window)
@@ -82,4 +84,17 @@ def rmse(estimate: ArrayLike, truth: ArrayLike, *, components: Components = None
 def _pick(x, components):
     if components is None or isinstance(components, slice):
         return x[..., components or slice(None)]
-    return x[..., np.asarray(components, np.int32)]
+    index = check_components(components, x.shape[-1])
+    return x[..., index]
+
+
+def check_components(components: Any, n: int) -> np.ndarray:
+    """The indices as an array, or an error that names ``components`` if they are none of 0..n - 1 (or from the end)."""
+    index = numbers("components", components)
+    if index.size and not np.issubdtype(index.dtype, np.integer):
+        raise TypeError(f"components: expected integers, got {index.dtype}")
+    if index.ndim != 1 or index.size == 0:
+        raise ValueError(f"components: expected one or more indices, got {components!r}")
+    if ((index < -n) | (index >= n)).any():
+        raise ValueError(f"components: expected indices of {n} components, got {index.tolist()}")
+    return index.astype(np.int32)

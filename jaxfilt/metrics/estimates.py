@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfilt.core import numbers
+
 
 class Estimate(NamedTuple):
     """An average over runs and its standard error (infinite for a single run: nothing is known about the spread)."""
@@ -25,7 +27,8 @@ def mean(values: Any) -> Estimate:
         ``Estimate(value (...), standard_error (...))``, computed in float64.
     """
     values = _rows("values", values)
-    return Estimate(values.mean(axis=0), _standard_error(values))
+    with np.errstate(invalid="ignore"):  # of infinite values: undefined, as it is
+        return Estimate(values.mean(axis=0), _standard_error(values))
 
 
 def root_mean(squares: Any) -> Estimate:
@@ -36,6 +39,9 @@ def root_mean(squares: Any) -> Estimate:
     Args:
         squares: (runs, ...) nonnegative, such as :func:`jaxfilt.metrics.mse` of each run.
     """
+    squares = _rows("squares", squares)
+    if (squares < 0).any():
+        raise ValueError(f"squares: expected values >= 0, got {squares.min()}")
     return _root(mean(squares))
 
 
@@ -64,7 +70,7 @@ def ratio(numerator: Any, denominator: Any, *, root: bool = False) -> Estimate:
 
 
 def _rows(name, values):
-    values = np.asarray(values, np.float64)
+    values = numbers(name, values).astype(np.float64)
     if values.ndim == 0 or values.shape[0] == 0:
         raise ValueError(f"{name}: expected shape (runs, ...) with at least one run, got {values.shape}")
     return values

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxfilt.core import check_count
 from jaxfilt.linalg import chol, sym
+from jaxfilt.models.linear import check_covariance, check_finite, check_shape, common_dtype
 
 _DOUBLINGS = 30
 
@@ -42,8 +44,20 @@ def predictor_gains(
 
     Source: Simon 2006, sections 11.3 and 12.1.
     """
-    F, H, Q, R, K = (jnp.asarray(x) for x in (F, H, Q, R, K))
-    n = F.shape[0]
+    given = {"F": F, "H": H, "Q": Q, "R": R, "K": K}
+    dtype = common_dtype({**given, "weight": 0.0 if weight is None else weight})
+    check_count("frequencies", frequencies, 1)
+    n, m = (*jnp.shape(K), 0, 0)[:2]
+    if jnp.ndim(K) != 2 or 0 in (n, m):
+        raise ValueError(f"K: expected shape (n, m), got {jnp.shape(K)}")
+    shapes = {"F": (n, n), "H": (m, n), "Q": (n, n), "R": (m, m), "K": (n, m)}
+    for name, shape in shapes.items():
+        check_shape(name, given[name], shape, f" with K of shape ({n}, {m})")
+        (check_covariance if name in "QR" else check_finite)(name, given[name])
+    if weight is not None:
+        check_shape("weight", weight, (n, n))
+        check_covariance("weight", weight)
+    F, H, Q, R, K = (jnp.asarray(x, dtype) for x in (F, H, Q, R, K))
     A = F - K @ H
     S = jnp.eye(n, dtype=F.dtype) if weight is None else jnp.asarray(weight, F.dtype)
     noise = sym(Q + K @ R @ K.T)

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.core import Static, is_concrete
+from jaxfilt.core import Static, is_concrete, real_array
 from jaxfilt.models.linear import LinearGaussian, check_linear, common_dtype
 
 
@@ -123,8 +123,8 @@ def lag_inputs(ys: Any, lag: Any, max_delay: int) -> dict[str, Array]:
     """
     common_dtype({"ys": ys})
     check_delay(max_delay)
-    ys, lag = jnp.asarray(ys), jnp.asarray(lag)
-    if ys.ndim != 2:
+    ys, lag = jnp.asarray(ys), real_array("lag", lag)
+    if ys.ndim != 2 or ys.size == 0:
         raise ValueError(f"ys: expected shape (T, m), got {ys.shape}")
     if not jnp.issubdtype(lag.dtype, jnp.integer):
         raise TypeError(f"lag: expected integers, got {lag.dtype}")

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import is_concrete
-from jaxfilt.models.linear import common_dtype
+from jaxfilt.core import is_concrete, real_array
+from jaxfilt.models.linear import check_positive, common_dtype
 
 
 def imu_inputs(
@@ -52,6 +52,9 @@ def imu_inputs(
         raise ValueError(f"gyr: expected the shape of acc {np.shape(acc)}, got {np.shape(gyr)}")
     if mask is not None and np.shape(mask) not in (np.shape(acc), np.shape(acc)[:-1]):
         raise ValueError(f"mask: expected shape {np.shape(acc)} or {np.shape(acc)[:-1]}, got {np.shape(mask)}")
+    check_positive("gravity", gravity)
+    if mask is not None and real_array("mask", mask).dtype != np.dtype(bool):
+        raise TypeError(f"mask: expected bool, got {np.asarray(mask).dtype}")
     if is_concrete((gyr, acc, mask)):
         gyr = _checked_gyro(np.asarray(gyr), gyr_hold)
         _check_accelerometer(np.asarray(acc), None if mask is None else np.asarray(mask), at_rest, gravity)

@@ -115,7 +115,9 @@ def common_dtype(arrays: dict[str, Any]) -> np.dtype:
     """
     dtypes = {}
     for name, x in arrays.items():
-        for leaf in [x] if x is None else jax.tree.leaves(x):
+        if x is None:
+            raise TypeError(f"{name}: expected an array or numbers, got None")
+        for leaf in jax.tree.leaves(x):
             if hasattr(leaf, "dtype"):
                 if not jnp.issubdtype(leaf.dtype, jnp.floating):
                     raise TypeError(f"{name}: expected a float array, got {leaf.dtype}")
@@ -143,7 +145,7 @@ def check_shape(name: str, x: Any, shape: tuple[int | None, ...], why: str = "")
         wanted = (
             "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"
         )
-        raise ValueError(f"{name}: expected shape {wanted}{why}, got {jnp.shape(x)}") from None
+        raise ValueError(f"{name}: expected shape {wanted}, got {jnp.shape(x)}{why}") from None
 
 
 def check_finite(name: str, x: Any) -> None:
@@ -176,8 +178,13 @@ def check_covariance(name: str, x: Any) -> None:
         )
 
 
-def check_positive(name: str, x: Any, *, zero: bool = False) -> None:
-    """Raises a ValueError that names ``x`` if it is concrete and not positive (or, with ``zero``, negative)."""
+def check_positive(name: str, x: Any, *, zero: bool = False, scalar: bool = False) -> None:
+    """Raises a ValueError that names ``x`` if it is concrete and not positive (or, with ``zero``, negative).
+
+    With ``scalar`` also if its shape is not ().
+    """
+    if scalar and jnp.shape(numbers(name, x) if is_concrete(x) else x) != ():
+        raise ValueError(f"{name}: expected a scalar, got shape {jnp.shape(x)}")
     if is_concrete(x):
         a = numbers(name, x)
         if not (np.isfinite(a) & ((a >= 0) if zero else (a > 0))).all():

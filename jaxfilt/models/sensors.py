@@ -75,7 +75,7 @@ def bearing_doppler(
     Raises:
         ValueError: speed <= 0, a (concrete) R that is not positive definite, another doppler.
     """
-    check_positive("speed", speed)
+    check_positive("speed", speed, scalar=True)
     if doppler not in ("first", "exact"):
         raise ValueError(f'doppler: expected "first" or "exact", got {doppler!r}')
     noise = _covariance(R, 2)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.models.delays import check_probabilities
+from jaxfilt.core import check_count, check_key, real_array
+from jaxfilt.models.delays import check_delay, check_probabilities
 from jaxfilt.models.linear import common_dtype
 
 
@@ -41,6 +42,11 @@ def draw_delays(probabilities: Any, shape: tuple[int, ...], key: Array) -> Array
     """
     p = jnp.asarray(probabilities, common_dtype({"probabilities": probabilities}))
     check_probabilities("probabilities", p)
+    check_key(key)
+    if not isinstance(shape, tuple | list) or len(shape) not in (1, 2):
+        raise ValueError(f"shape: expected (T,) or (T, m), got {shape!r}")
+    for size in shape:
+        check_count("shape", size, 1)
     try:
         p = jnp.broadcast_to(p, (*shape, p.shape[-1]))
     except ValueError:
@@ -70,10 +76,9 @@ def deliver(zs: Any, delays: Any, max_delay: int) -> Received:
     Source: Sun 2013, eq. (1); the recursion over the packets under way gives the same series.
     """
     common_dtype({"zs": zs})
-    zs, delays = jnp.asarray(zs), jnp.asarray(delays)
-    if max_delay < 0:
-        raise ValueError(f"max_delay: expected at least 0, got {max_delay}")
-    if zs.ndim != 2:
+    zs, delays = jnp.asarray(zs), real_array("delays", delays)
+    check_delay(max_delay)
+    if zs.ndim != 2 or zs.size == 0:
         raise ValueError(f"zs: expected shape (T, m), got {zs.shape}")
     if not jnp.issubdtype(delays.dtype, jnp.integer):
         raise TypeError(f"delays: expected integers, got {delays.dtype}")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import is_concrete
+from jaxfilt.core import check_count, check_key, is_concrete, number, numbers
 
 
 def gap_mask(
@@ -30,12 +30,15 @@ def gap_mask(
     Raises:
         ValueError: a gap outside 0..T-1 or with last < first, a component outside 0..m-1, components without m.
     """
-    if T < 1:
-        raise ValueError(f"T: expected at least 1, got {T}")
+    check_count("T", T, 1)
+    if m is not None:
+        check_count("m", m, 1)
     if components is not None and m is None:
         raise ValueError("components: given without m, the number of components")
     mask = np.ones((T, 1 if m is None else m), bool)
-    lost = list(range(mask.shape[1])) if components is None else list(components)
+    lost = list(range(mask.shape[1])) if components is None else numbers("components", components).ravel().tolist()
+    if any(not isinstance(c, int) for c in lost):
+        raise TypeError(f"components: expected integers, got {lost}")
     if any(not 0 <= c < mask.shape[1] for c in lost):
         raise ValueError(f"components: expected values in 0..{mask.shape[1] - 1}, got {lost}")
     for first, last in gaps:
@@ -53,7 +56,11 @@ def random_loss(key: Array, T: int, probability: Any, *, m: int | None = None) -
     Raises:
         ValueError: a (concrete) probability outside [0, 1].
     """
-    if is_concrete(probability) and not 0 <= probability <= 1:
+    check_key(key)
+    check_count("T", T, 1)
+    if m is not None:
+        check_count("m", m, 1)
+    if is_concrete(probability) and not 0 <= number("probability", probability) <= 1:
         raise ValueError(f"probability: expected a value in [0, 1], got {probability}")
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, np.arange(T, dtype=np.uint32))
     shape = () if m is None else (m,)
@@ -72,6 +79,13 @@ def random_gap(key: Array, T: int, *, length: tuple[int, int], first: tuple[int,
     Raises:
         ValueError: an empty or negative range, a first sample outside the series.
     """
+    check_key(key)
+    check_count("T", T, 1)
+    for name, ends, least in (("length", length, 1), ("first", first, 0)):
+        if not isinstance(ends, tuple | list) or len(ends) != 2:
+            raise ValueError(f"{name}: expected (smallest, largest), got {ends!r}")
+        for end in ends:
+            check_count(name, end, least)
     if not 0 < length[0] <= length[1]:
         raise ValueError(f"length: expected 1 <= shortest <= longest, got {length}")
     if not 0 <= first[0] <= first[1] < T:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxfilt.core import check_key, numbers
 from jaxfilt.filters.attitude import GRAVITY, check_frame
 from jaxfilt.linalg import sym
 from jaxfilt.models.linear import check_finite, check_positive, check_shape, common_dtype
@@ -70,16 +71,23 @@ def imu(
         ValueError: wrong shapes, dt or gravity not positive, an unknown frame.
         TypeError: integer arrays or mixed float dtypes.
     """
-    dtype = common_dtype({"attitude": attitude, "acceleration": acceleration})
+    given: dict[str, Any] = {"lever": lever, "bias0": bias0, "acc_bias": acc_bias}
+    sizes = {"dt": dt, "gyr_std": gyr_std, "acc_std": acc_std, "bias_walk": bias_walk, "gravity": gravity}
+    shapes = {"gyr_matrix": gyr_matrix, "acc_matrix": acc_matrix}
+    shapes = {name: x for name, x in shapes.items() if x is not None}
+    dtype = common_dtype({"attitude": attitude, "acceleration": acceleration, **given, **sizes, **shapes})
+    check_key(key)
+    for name, x in sizes.items():
+        check_shape(name, x, ())
+        check_positive(name, x, zero=name not in ("dt", "gravity"))
+    for name, x in {"attitude": attitude, "acceleration": acceleration, **shapes}.items():
+        check_finite(name, x)
     attitude, acceleration = jnp.asarray(attitude, dtype), jnp.asarray(acceleration, dtype)
     check_shape("attitude", attitude, (None, 3, 3))
     check_shape("acceleration", acceleration, (None, 3))
-    check_positive("dt", dt)
-    check_positive("gravity", gravity)
     fine, samples = len(attitude) - 1, len(acceleration) - 1
     if samples < 1 or fine < samples or fine % samples:
         raise ValueError(f"attitude: expected (T - 1) K + 1 entries for T = {samples + 1}, got {fine + 1}")
-    given: dict[str, Any] = {"lever": lever, "bias0": bias0, "acc_bias": acc_bias}
     vectors = {name: jnp.asarray(x, dtype) for name, x in given.items()}
     for name, x in vectors.items():
         check_shape(name, x, (3,))
@@ -121,6 +129,10 @@ def _logarithm(R):
 
 def euler_attitude(roll: Array, pitch: Array, yaw: Array) -> Array:
     """Rotation matrices (T, 3, 3), body to earth, of ZYX Euler angles (T,) [rad]."""
+    common_dtype({"roll": roll, "pitch": pitch, "yaw": yaw})
+    roll, pitch, yaw = jnp.asarray(roll), jnp.asarray(pitch), jnp.asarray(yaw)
+    if not roll.shape == pitch.shape == yaw.shape:
+        raise ValueError(f"roll, pitch, yaw: expected one shape, got {roll.shape}, {pitch.shape}, {yaw.shape}")
     cr, sr = jnp.cos(roll), jnp.sin(roll)
     cp, sp = jnp.cos(pitch), jnp.sin(pitch)
     cy, sy = jnp.cos(yaw), jnp.sin(yaw)
@@ -134,5 +146,10 @@ def euler_attitude(roll: Array, pitch: Array, yaw: Array) -> Array:
 
 def axis_of_quaternion(q: Any) -> np.ndarray:
     """The vertical axis (..., 3) in the body's frame, of quaternions (..., 4) body to earth, scalar first."""
-    w, x, y, z = np.moveaxis(np.asarray(q, np.float64), -1, 0)
+    q = numbers("q", q).astype(np.float64)
+    if q.ndim == 0 or q.shape[-1] != 4:
+        raise ValueError(f"q: expected shape (..., 4), got {q.shape}")
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    if not np.isfinite(q).all():
+        raise ValueError("q: expected finite values")
     return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z], axis=-1)

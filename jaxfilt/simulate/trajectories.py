@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxfilt import core
-from jaxfilt.core import PyTree, StepInput
+from jaxfilt.core import PyTree, StepInput, is_concrete, numbers
 from jaxfilt.filters.kalman import input_term
 from jaxfilt.linalg import chol, solve_chol, sym
 from jaxfilt.models.linear import LinearGaussian, check_finite, check_linear, check_shape, value
@@ -84,6 +84,8 @@ def _inputs(T, dtype, dt, u, key) -> StepInput:
 
 
 def _state(name, x, model, leading):
+    if is_concrete(x):
+        numbers(name, x)
     dtype = getattr(x, "dtype", model.m0.dtype)
     if dtype != model.m0.dtype:
         raise TypeError(f"{name}: is {dtype}, but the model is {model.m0.dtype}; convert one of them")

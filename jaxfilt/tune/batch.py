@@ -62,12 +62,12 @@ def filter_batch(
 
 def batch_shape(ys: Array) -> tuple[int, int, int]:
     """(B, T, m). Raises ValueError for another rank."""
-    if not hasattr(ys, "ndim"):
-        ys = core.numbers("ys", ys)
+    core.check_float("ys", ys)
     if np.ndim(ys) != 3:
         raise ValueError(f"ys: expected shape (B, T, m), got {jnp.shape(ys)}")
-    core.check_float("ys", ys)
     runs, T, m = jnp.shape(ys)
+    if 0 in (runs, T, m):
+        raise ValueError(f"ys: expected at least one sample, got shape {jnp.shape(ys)}")
     return runs, T, m
 
 

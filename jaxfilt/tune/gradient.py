@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxfilt.core import aspartial, check_count, check_key
+from jaxfilt.core import aspartial, check_count, check_key, number
 from jaxfilt.linalg import structure
 from jaxfilt.models.linear import check_finite
 from jaxfilt.tune import params as spaces
@@ -73,6 +73,7 @@ def gradient(
     if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
         raise TypeError(f"optimizer: expected an optax optimizer, got {type(optimizer).__name__}")
     check_key(key)
+    spread = number("spread", spread)
     check_finite("spread", spread)
     check_time_limit(time_limit)
     optimizer = optax.with_extra_args_support(_ADAM if optimizer is None else optimizer)

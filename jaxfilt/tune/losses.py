@@ -95,7 +95,7 @@ def rmse(
     Returns:
         () in the components' unit; infinite if the window is empty.
     """
-    index = _indices(truth, components)
+    index = _indices(ys, truth, components)
     mean = filter_batch(_posterior_mean, filt, ys, key, **options)
     error = mean[..., index] - truth[..., index]
     mse = weighted_mean(jnp.sum(error * error, axis=-1), _in_window(ys, window))
@@ -120,7 +120,7 @@ def consistency(
 
     Arguments as in :func:`rmse`. Raises ValueError if the filter has no covariance.
     """
-    index = _indices(truth, components)
+    index = _indices(ys, truth, components)
     mean, cov = filter_batch(_posterior, filt, ys, key, **options)
     error = mean[..., index] - truth[..., index]
     nees = jax.vmap(jax.vmap(_squared_norm))(error, cov[..., index[:, None], index[None, :]])
@@ -167,11 +167,14 @@ def _in_window(ys, window):
     return jnp.broadcast_to(window, (runs, T))
 
 
-def _indices(truth, components):
+def _indices(ys, truth, components):
     """The chosen components as an index array; ``truth`` may lack components after the last of them."""
+    batch_shape(ys)
     core.check_float("truth", truth)
-    if jnp.ndim(truth) != 3:
-        raise ValueError(f"truth: expected shape (B, T, n), got {jnp.shape(truth)}")
+    if getattr(truth, "dtype", None) != getattr(ys, "dtype", None):
+        raise TypeError(f"truth: expected an array of the dtype of ys, {getattr(ys, 'dtype', None)}")
+    if jnp.ndim(truth) != 3 or jnp.shape(truth)[:2] != jnp.shape(ys)[:2]:
+        raise ValueError(f"truth: expected shape (B, T, n), got {jnp.shape(truth)} with ys {jnp.shape(ys)}")
     n = jnp.shape(truth)[-1]
     chosen = slice(None) if components is None else components
     if not isinstance(chosen, slice | tuple | list | np.ndarray):
@@ -179,7 +182,10 @@ def _indices(truth, components):
     if not isinstance(chosen, slice):
         chosen = list(chosen)
     try:
-        return np.atleast_1d(np.arange(n)[chosen])
+        found = np.atleast_1d(np.arange(n)[chosen])
+        if found.ndim == 1 and found.size:
+            return found
+        raise ValueError(f"components: expected one or more indices, got {components}")
     except (IndexError, TypeError):
         raise ValueError(f"components: {components} do not exist in truth of shape {jnp.shape(truth)}") from None
 

@@ -198,7 +198,12 @@ def unconstrain(space: PyTree, params: PyTree) -> Array:
             raise ValueError(f"params: expected a leaf of shape {np.shape(leaf.init)}, got {x.shape}")
         return TRANSFORMS[leaf.kind][1](x, *_args(leaf, dtype)).ravel()
 
-    parts = jax.tree.map(coordinates, space, params, is_leaf=_is_spec)
+    try:
+        parts = jax.tree.map(coordinates, space, params, is_leaf=_is_spec)
+    except (ValueError, TypeError) as error:
+        if str(error).startswith("params: "):
+            raise
+        raise ValueError(f"params: expected the structure of space; {error}") from None
     return jnp.concatenate([jnp.zeros((0,), dtype), *jax.tree.leaves(parts)])
 
 
@@ -208,10 +213,9 @@ def constrain(space: PyTree, z: Array) -> PyTree:
     Raises:
         ValueError: if ``z`` has another shape.
     """
-    if not hasattr(z, "dtype"):
-        z = jnp.asarray(core.numbers("z", z))
+    z = core.real_array("z", z)
     if jnp.shape(z) != (size(space),):
-        raise ValueError(f"z: expected shape ({size(space)},), got {jnp.shape(z)}")
+        raise ValueError(f"z: expected shape ({size(space)},) for this space, got {jnp.shape(z)}")
     leaves, structure = jax.tree.flatten(space, is_leaf=_is_spec)
     start, values = 0, []
     for leaf in leaves:

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt import maneuver
-from jaxfilt.core import Filter, Info, PyTree, Static, Status, Wrapped, multiply, present, wrap
+from jaxfilt.core import Filter, Info, PyTree, Static, Status, Wrapped, check_filter, multiply, present, wrap
 from jaxfilt.filters.common import decoupled, masked_rows
 from jaxfilt.linalg import chol, solve_chol, sym
 from jaxfilt.models.linear import check_positive
@@ -78,7 +78,7 @@ def q_inflated(filt: Filter, factor: Any = 200.0) -> Filter:
 
     Source: Bar-Shalom, Li and Kirubarajan 2001, section 11.2.
     """
-    check_positive("factor", factor)
+    check_positive("factor", factor, scalar=True)
     return wrap(_Inflated(filt, factor), init=_alarm_init, predict=_q_predict, update=_alarm_update)
 
 
@@ -96,7 +96,7 @@ def p_inflated(filt: Filter, factor: Any = 5.0) -> Filter:
 
     Source: Bar-Shalom, Li and Kirubarajan 2001, section 11.2.
     """
-    check_positive("factor", factor)
+    check_positive("factor", factor, scalar=True)
     _check_moments(filt, "p_inflated")
     return wrap(_Inflated(filt, factor), init=_alarm_init, predict=_p_predict, update=_alarm_update)
 
@@ -126,14 +126,15 @@ def gain_floor(filt: Filter, *, alpha: Any, beta: Any, dt: Any) -> Filter:
 
     Source: Bar-Shalom, Li and Kirubarajan 2001, section 11.2; thesis on lost targets, section 3-3-4.
     """
-    check_positive("alpha", alpha, zero=True)
-    check_positive("beta", beta, zero=True)
-    check_positive("dt", dt)
+    check_positive("alpha", alpha, zero=True, scalar=True)
+    check_positive("beta", beta, zero=True, scalar=True)
+    check_positive("dt", dt, scalar=True)
     _check_moments(filt, "gain_floor")
     return wrap(_Floor(filt, alpha, beta, dt), init=_alarm_init, update=_gain_update)
 
 
 def _check_moments(filt, wrapper):
+    check_filter(filt)
     if filt.moments is None or filt.with_moments is None:
         raise ValueError(f"filt: {wrapper} needs a filter with moments and with_moments")
 

@@ -82,6 +82,8 @@ def blend(
         ValueError: no candidates, a window < 1, a degree < 0 or >= its window, horizon or origins < 1, exponent <= 0,
             floor < 0; at trace time, a filter without innovation_cov or noise_cov.
     """
+    if not isinstance(candidates, Sequence):
+        raise TypeError(f"candidates: expected pairs (window, degree), got {candidates!r}")
     pairs = all(isinstance(candidate, Sequence) and len(candidate) == 2 for candidate in candidates)
     if not candidates or not pairs:
         raise ValueError(f"candidates: expected pairs (window, degree), got {candidates}")
@@ -93,8 +95,8 @@ def blend(
             raise ValueError(f"candidates: ({window}, {degree}): {error}") from None
     check_count("horizon", horizon, 1)
     check_count("origins", origins, 1)
-    check_positive("exponent", exponent)
-    check_positive("floor", floor, zero=True)
+    check_positive("exponent", exponent, scalar=True)
+    check_positive("floor", floor, zero=True, scalar=True)
     params = _Params(filt, exponent, floor, Static(_Options(candidates, horizon, origins)))
     return wrap(params, init=_init, predict=_predict, update=_update)
 

@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 
 from jaxfilt import fuzzy
-from jaxfilt.core import Filter, Static, Wrapped, multiply, present, wrap
-from jaxfilt.models.linear import check_finite, check_positive
+from jaxfilt.core import Filter, Static, Wrapped, multiply, number, present, wrap
+from jaxfilt.models.linear import check_finite, check_positive, check_shape
 from jaxfilt.wrappers.common import covariances
 from jaxfilt.wrappers.noise import Q_BOUNDS, R_BOUNDS, check_bounds, check_forgetting, clip, usable
 
@@ -128,9 +128,11 @@ def fuzzy_scaled(
     if not isinstance(system, fuzzy.Mamdani):
         raise TypeError(f"system: expected a jf.fuzzy.Mamdani, got {type(system).__name__}")
     for name, x in (("unit", unit), ("reference", reference), ("floor", floor)):
-        check_positive(name, x)
+        check_positive(name, x, scalar=name != "unit")
+    _check_unit(unit)
     for name, x in (("r_exponent", r_exponent), ("q_exponent", q_exponent)):
         check_finite(name, x)
+        check_shape(name, x, ())
     return wrap(
         _Scaled(
             filt, system, unit, reference, (r_exponent, q_exponent), floor,
@@ -160,14 +162,20 @@ def fuzzy_noise_parameters(
     check_positive("alpha", alpha)
     if np.ndim(alpha) != 1 or np.size(alpha) < 2:
         raise ValueError(f"alpha: expected shape (L,) with L >= 2, got {np.shape(alpha)}")
-    if forgetting != 0:
+    check_shape("forgetting", forgetting, ())
+    if number("forgetting", forgetting) != 0:
         check_forgetting(forgetting)
     L = np.size(alpha)
     segment = np.asarray(universe, np.float64).reshape(-1, 1) / (2 * L - 1)
     gaps = segment * np.where(np.arange(L - 1) == 0, 1.5, 2.0)
     widths = np.broadcast_to(segment / 4, gaps.shape)
     log_alpha = np.log(np.asarray(alpha, np.float64))
-    dtype = float if dtype is None else dtype
+    try:
+        dtype = np.dtype(float if dtype is None else dtype)
+    except TypeError:
+        raise TypeError(f"dtype: expected a float dtype, got {dtype!r}") from None
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise TypeError(f"dtype: expected a float dtype, got {dtype}")
     return FuzzyNoise(*(jnp.asarray(x, dtype) for x in (forgetting, gaps, widths, log_alpha, log_alpha)))
 
 
@@ -223,6 +231,7 @@ def fuzzy_noise(
     """
     _check_which(scale)
     check_positive("unit", unit)
+    _check_unit(unit)
     if not isinstance(parameters, FuzzyNoise):
         raise TypeError(f"parameters: expected a FuzzyNoise, got {type(parameters).__name__}")
     if np.ndim(parameters.gaps) != 2:
@@ -247,6 +256,11 @@ def fuzzy_noise(
         ),
         init=_smooth_init, predict=_predict, update=_smooth_update,
     )  # fmt: skip
+
+
+def _check_unit(unit):
+    if jnp.ndim(unit) > 1 or jnp.size(unit) == 0:
+        raise ValueError(f"unit: expected shape () or (m,), got {jnp.shape(unit)}")
 
 
 def _check_which(scale):

@@ -125,7 +125,7 @@ def scan_inputs(detections: Any, valid: Any = None, *, u: PyTree = None) -> dict
 
 
 def _check_probability(p_false):
-    check_positive("p_false", p_false)
+    check_positive("p_false", p_false, scalar=True)
     if is_concrete(p_false) and not (np.asarray(p_false) < 1).all():
         raise ValueError(f"p_false: expected a value in (0, 1), got {p_false}")
 

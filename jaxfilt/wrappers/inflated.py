@@ -29,7 +29,7 @@ def coast_inflated(filt: Filter, factor: Any = 10.0) -> Filter:
     Raises:
         ValueError: factor <= 0.
     """
-    check_positive("factor", factor)
+    check_positive("factor", factor, scalar=True)
     return wrap(_Params(filt, factor), predict=_predict)
 
 

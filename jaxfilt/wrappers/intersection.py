@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxfilt.core import Filter, Static, Status, Wrapped, flag, multiply, present, wrap
+from jaxfilt.core import Filter, Static, Status, Wrapped, check_filter, flag, multiply, present, wrap
 from jaxfilt.filters.common import decoupled
 from jaxfilt.linalg import chol, solve_lower
 from jaxfilt.wrappers.common import covariances, predict_measurement
@@ -57,6 +57,7 @@ def covariance_intersection(
 
     Source: Julier and Uhlmann 1997.
     """
+    check_filter(filt)
     if filt.moments is None or filt.with_moments is None:
         raise ValueError("filt: covariance intersection needs a filter with moments and with_moments")
     max_age = 3 * window if max_age is None and isinstance(window, int) else max_age

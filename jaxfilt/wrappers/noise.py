@@ -13,7 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Static, Status, StepInput, Wrapped, flag, is_concrete, multiply, present, wrap
+from jaxfilt.core import (
+    Filter,
+    Info,
+    Static,
+    Status,
+    StepInput,
+    Wrapped,
+    check_filter,
+    flag,
+    is_concrete,
+    multiply,
+    present,
+    wrap,
+)
 from jaxfilt.filters.common import decoupled
 from jaxfilt.linalg import chol, solve_chol, solve_lower
 from jaxfilt.models.linear import check_positive
@@ -100,7 +113,7 @@ def sage_husa(
     Source: Sage and Husa 1969; the positive form for R: Mohamed and Schwarz 1999 (there over a window).
     """
     check_forgetting(forgetting)
-    check_positive("prior", prior, zero=True)
+    check_positive("prior", prior, zero=True, scalar=True)
     bounds = _check_scale(scale, bounds)
     return wrap(
         _SageHusa(filt, forgetting, prior, bounds, Static(scale)),
@@ -174,9 +187,10 @@ def fading_memory(filt: Filter, factor: Any = 1.02) -> Filter:
 
     Source: Fagin 1964; Sorenson and Sacks 1971; Simon 2006, section 7.4 (his alpha is the root of the factor).
     """
-    check_positive("factor", factor)
+    check_positive("factor", factor, scalar=True)
     if is_concrete(factor) and not (np.asarray(factor) >= 1).all():
         raise ValueError(f"factor: expected a value >= 1, got {factor}")
+    check_filter(filt)
     if filt.moments is None or filt.with_moments is None:
         raise ValueError("filt: fading_memory needs a filter with moments and with_moments")
     return wrap(_Fading(filt, factor), predict=_fading_predict)
@@ -187,14 +201,14 @@ def fading_memory(filt: Filter, factor: Any = 1.02) -> Filter:
 
 def check_forgetting(forgetting: Any) -> None:
     """Raises a ValueError unless forgetting is in (0, 1), if concrete."""
-    check_positive("forgetting", forgetting)
+    check_positive("forgetting", forgetting, scalar=True)
     if is_concrete(forgetting) and not (np.asarray(forgetting) < 1).all():
         raise ValueError(f"forgetting: expected a value in (0, 1), got {forgetting}")
 
 
 def check_rate(rate: Any, *, closed: bool = False) -> None:
     """Raises a ValueError unless rate is in [0, 1), or with ``closed`` in [0, 1], if concrete."""
-    check_positive("rate", rate, zero=True)
+    check_positive("rate", rate, zero=True, scalar=True)
     if is_concrete(rate) and not (np.asarray(rate) < 1).all() and not (closed and (np.asarray(rate) == 1).all()):
         raise ValueError(f"rate: expected a value in [0, 1{']' if closed else ')'}, got {rate}")
 

@@ -58,8 +58,8 @@ def phase_locked(filt: Filter, *, amplitude: Any = 1.0, normalize: bool = True, 
 
     Source: Analog Devices, AD2S1210 data sheet (the loop); the identity with alpha-beta: Kalata 1984 for the gains.
     """
-    check_positive("amplitude", amplitude)
-    check_positive("floor", floor, zero=True)
+    check_positive("amplitude", amplitude, scalar=True)
+    check_positive("floor", floor, zero=True, scalar=True)
     return wrap(_Params(filt, amplitude, floor, Static(bool(normalize))), init=_init, predict=_predict, update=_update)
 
 

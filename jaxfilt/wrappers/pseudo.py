@@ -145,7 +145,7 @@ def sinusoid_fit(
     Source: thesis on lost targets, chapter 4, which leaves the family of functions open.
     """
     check_count("window", window, 3)
-    check_positive("interval", interval)
+    check_positive("interval", interval, scalar=True)
     max_age = 3 * window if max_age is None else max_age
     check_fit(window, 0, 1.0, max_age)
     if not callable(omega) and (isinstance(omega, bool) or not isinstance(omega, int)):

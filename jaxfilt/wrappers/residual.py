@@ -58,7 +58,7 @@ def residual_r(filt: Filter, *, rate: Any = 0.02, largest: Any = 100.0) -> Filte
     Source: Akhlaghi, Zhou and Huang 2017; the bound is ours.
     """
     check_rate(rate)
-    check_positive("largest", largest)
+    check_positive("largest", largest, scalar=True)
     return wrap(_Residual(filt, rate, largest), init=_residual_init, predict=_residual_predict, update=_residual_update)
 
 
@@ -83,7 +83,7 @@ def nis_q(filt: Filter, *, window: int = 25, largest: Any = 100.0) -> Filter:
         ValueError: window < 2, largest < 1; at trace time, a filter without nis.
     """
     check_count("window", window, 2)
-    check_positive("largest", largest)
+    check_positive("largest", largest, scalar=True)
     if is_concrete(largest) and not (np.asarray(largest) >= 1).all():
         raise ValueError(f"largest: expected a value >= 1, got {largest}")
     return wrap(_Nis(filt, largest, Static(window)), init=_nis_init, predict=_nis_predict, update=_nis_update)

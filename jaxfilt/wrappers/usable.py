@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jaxfilt.core import Filter, Status, aspartial, flag, present, wrap
+from jaxfilt.core import Filter, Status, aspartial, check_filter, flag, present, wrap
 
 
 class _Params(NamedTuple):
@@ -29,9 +29,10 @@ def usable_where(filt: Filter, condition: Callable) -> Filter:
     Raises:
         ValueError: a filter without moments; at trace time, a condition of another shape.
     """
+    check_filter(filt)
     if filt.moments is None:
         raise ValueError("filt: usable_where needs a filter with moments")
-    return wrap(_Params(filt, aspartial(condition)), update=_update)
+    return wrap(_Params(filt, aspartial(condition, "condition")), update=_update)
 
 
 def _update(p, s, inp):

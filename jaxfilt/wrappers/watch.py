@@ -32,7 +32,7 @@ def watched(filt: Filter, *, limit: Any = 5.0, count: int = 20) -> Filter:
     Raises:
         ValueError: limit <= 0 or count < 1; at trace time, a filter that reports no innovation_cov.
     """
-    check_positive("limit", limit)
+    check_positive("limit", limit, scalar=True)
     check_count("count", count, 1)
     return wrap(_Params(filt, limit, Static(count)), init=_init, update=_update)
 

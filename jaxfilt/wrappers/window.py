@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxfilt.core import Prediction, StepInput, Wrapped, is_concrete
 from jaxfilt.linalg import chol, solve_chol
-from jaxfilt.models.linear import check_positive
+from jaxfilt.models.linear import check_positive, check_shape
 from jaxfilt.wrappers.common import check_count
 
 
@@ -132,7 +132,8 @@ def check_fit(window: Any, degree: Any, forgetting: Any, max_age: Any) -> None:
         raise ValueError(f"degree: expected less than window = {window}, got {degree}")
     if max_age is not None:
         check_count("max_age", max_age, 1)
-    check_positive("forgetting", forgetting)
+    check_positive("forgetting", forgetting, scalar=True)
+    check_shape("forgetting", forgetting, ())
     if is_concrete(forgetting) and not forgetting <= 1:
         raise ValueError(f"forgetting: expected a value in (0, 1], got {forgetting}")
 

@@ -218,8 +218,8 @@ def test_turning_the_axes_too_changes_only_which_root_is_drawn_from():
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"alpha": 0.0}, ValueError, "alpha: expected a value > 0"),
-        ({"alpha": np.nan}, ValueError, "alpha: expected a value > 0"),
+        ({"alpha": 0.0}, ValueError, "alpha: expected a finite value > 0"),
+        ({"alpha": np.nan}, ValueError, "alpha: expected a finite value > 0"),
         ({"kappa": -3.0}, ValueError, r"kappa: expected n \+ kappa > 0 with n = 3"),
         ({"beta": np.float32(2)}, TypeError, "beta is float32"),
     ],

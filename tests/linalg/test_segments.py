@@ -50,6 +50,7 @@ def test_xla_does_not_put_the_segments_together():
 
     def lines(f):
         text = jax.jit(jax.vmap(f)).lower(x).compile().as_text()
+        assert text is not None
         return sum(" tanh(" in line for line in text.splitlines())
 
     assert lines(segments.segmented(chain, x[0])) <= 40

@@ -99,7 +99,7 @@ def test_parameters_are_differentiable(builder):
         ({"dt": np.nan}, "dt: expected a finite value > 0"),
         ({"q": -0.1}, "q: expected a finite value >= 0"),
         ({"q": [0.1, 0.2, 0.3]}, "q: expected a scalar or shape"),
-        ({"r": -1.0}, "R: expected a positive semidefinite matrix"),
+        ({"r": -1.0}, "r: expected a finite value >= 0"),
         ({"r": [1.0, 2.0, 3.0]}, "r: expected a scalar"),
         ({"m0": np.zeros(3)}, "m0: expected shape"),
         ({"m0": np.zeros((2, 2))}, "m0: expected shape"),
