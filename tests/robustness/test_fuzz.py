@@ -52,6 +52,7 @@ ACCEPTED: dict[tuple[str, str], tuple[str, str]] = {
     **{("gains.is_stable", name): ("nan inf", "no such gain is stable") for name in ("alpha", "beta", "kappa")},
     **{("gains.from_unconstrained", name): ("inf", "the edge of the stable region") for name in "bc"},
     ("fuzzy.infer", "x"): ("nan inf", "NaN fires no rule, which is reported; beyond the universe its end counts"),
+    ("simulate.axis_of_quaternion", "q"): ("inf", "recordings have gaps; what is not finite stays so"),
     ("sincos.arctan", "ys"): ("nan inf", _MISSING),
     **{("sincos.calibrated", name): ("nan inf", "such a sample is not trusted") for name in ("mean", "cov")},
     ("sincos.mask_clipped", "ys"): ("nan", _MISSING),
