@@ -82,7 +82,9 @@ def _call(name, arguments) -> Any:
 
 
 def _numbers(result) -> list[np.ndarray]:
-    leaves = [leaf for leaf in jax.tree.leaves(result) if isinstance(leaf, float | np.ndarray | np.generic | jax.Array)]
+    leaves = [
+        leaf for leaf in jax.tree.leaves(result) if isinstance(leaf, bool | float | np.ndarray | np.generic | jax.Array)
+    ]
     arrays = [leaf for leaf in leaves if not jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key)]
     return [np.asarray(leaf) for leaf in arrays]
 
