@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.core import Static, is_concrete, real_array
+from jaxfilt.core import Static, check_count, is_concrete, real_array
 from jaxfilt.models.linear import LinearGaussian, check_linear, common_dtype
 
 
@@ -61,12 +61,6 @@ def check_probabilities(name: str, p: Array) -> None:
         raise ValueError(f"{name}: expected probabilities that sum to 1, got {a.tolist()}")
 
 
-def check_delay(max_delay: Any) -> None:
-    """Raises a ValueError if ``max_delay`` is no integer of at least 0."""
-    if isinstance(max_delay, bool) or not isinstance(max_delay, int | np.integer) or max_delay < 0:
-        raise ValueError(f"max_delay: expected an integer >= 0, got {max_delay!r}")
-
-
 def with_lags(model: LinearGaussian, max_delay: int) -> LinearGaussian:
     """The model with its d last states: a late measurement with a time stamp is then a measurement like any other.
 
@@ -84,7 +78,7 @@ def with_lags(model: LinearGaussian, max_delay: int) -> LinearGaussian:
         ValueError: d < 0, H or R that are functions, a model with D, or with correlated noise S (not covered).
     """
     check_linear(model)
-    check_delay(max_delay)
+    check_count("max_delay", max_delay, 0)
     H, R = model.H, model.R
     if callable(H) or callable(R):
         raise ValueError("model: H and R must be matrices, since a late packet was made at an earlier step")
@@ -122,7 +116,7 @@ def lag_inputs(ys: Any, lag: Any, max_delay: int) -> dict[str, Array]:
         TypeError: a lag that is not an integer.
     """
     common_dtype({"ys": ys})
-    check_delay(max_delay)
+    check_count("max_delay", max_delay, 0)
     ys, lag = jnp.asarray(ys), real_array("lag", lag)
     if ys.ndim != 2 or ys.size == 0:
         raise ValueError(f"ys: expected shape (T, m), got {ys.shape}")

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxfilt.core import check_count, check_key, real_array
-from jaxfilt.models.delays import check_delay, check_probabilities
+from jaxfilt.models.delays import check_probabilities
 from jaxfilt.models.linear import common_dtype
 
 
@@ -77,7 +77,7 @@ def deliver(zs: Any, delays: Any, max_delay: int) -> Received:
     """
     common_dtype({"zs": zs})
     zs, delays = jnp.asarray(zs), real_array("delays", delays)
-    check_delay(max_delay)
+    check_count("max_delay", max_delay, 0)
     if zs.ndim != 2 or zs.size == 0:
         raise ValueError(f"zs: expected shape (T, m), got {zs.shape}")
     if not jnp.issubdtype(delays.dtype, jnp.integer):
