@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxfilt.core import Filter, PyTree, Static, aspartial
+from jaxfilt.core import Filter, PyTree, Static, aspartial, check_count
 from jaxfilt.linalg import structure
 from jaxfilt.models.linear import LinearGaussian
 from jaxfilt.models.nonlinear import Nonlinear
@@ -48,8 +48,7 @@ def batch(
     Raises:
         ValueError: when it is called with nothing to batch over, or with different numbers of runs.
     """
-    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1:
-        raise ValueError(f"chunk: expected an int >= 1, got {chunk!r}")
+    check_count("chunk", chunk, 1)
     return partial(_call, aspartial(fn), in_axes, int(chunk), None if devices is None else tuple(devices))
 
 

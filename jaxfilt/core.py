@@ -519,7 +519,7 @@ def check_key(key: Any, name: str = "key") -> None:
 def check_count(name: str, value: Any, least: int) -> None:
     """Raises a ValueError that names an option if it is no integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
+        raise ValueError(f"{name}: expected an int >= {least}, got {value!r}")
 
 
 def numbers(name: str, x: Any) -> np.ndarray:

@@ -87,8 +87,7 @@ def detector(statistic: str = "fading", *, p_false: float = 1e-3, forgetting: fl
         raise ValueError(f"p_false: expected a value in [1e-9, 1), got {p_false}")
     if not 0 <= forgetting < 1:
         raise ValueError(f"forgetting: expected a value in [0, 1), got {forgetting}")
-    if isinstance(window, bool) or not isinstance(window, int) or window < 1:
-        raise ValueError(f"window: expected an integer >= 1, got {window!r}")
+    check_count("window", window, 1)
     return Detector(statistic, p_false, forgetting, 1 if statistic in ("nis", "fading") else window)
 
 

@@ -176,7 +176,7 @@ def monte_carlo(
             of another job.
         ImportError: ``progress`` without tqdm.
     """
-    _check_count("runs", runs)
+    core.check_count("runs", runs, 1)
     core.check_key(key)
     if not core.number("memory_limit", memory_limit) > 0:
         raise ValueError(f"memory_limit: expected bytes > 0, got {memory_limit}")
@@ -200,7 +200,7 @@ def monte_carlo(
     if chunk is None:
         per_device = _choose_chunk(-(-runs // len(devices)), bytes_per_run, memory_limit)
     else:
-        _check_count("chunk", chunk)
+        core.check_count("chunk", chunk, 1)
         per_device = -(-chunk // len(devices))
     compiled, lowered = _compile(job, per_device, static, devices)
     if chunk is None and (used := _working_memory(compiled)) > memory_limit:
@@ -332,11 +332,6 @@ def _of_all_processes(stacked):
 def _in_order(x, runs):
     x = np.swapaxes(x, 0, 1)
     return x.reshape(-1, *x.shape[3:])[:runs]
-
-
-def _check_count(name, x):
-    if isinstance(x, bool) or not isinstance(x, int | np.integer) or x < 1:
-        raise ValueError(f"{name}: expected an int >= 1, got {x!r}")
 
 
 def _import_tqdm():

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
@@ -106,8 +105,7 @@ def _block(block, T):
     if block is None:
         block = max(1, round(T**0.5))
         return block if jax.default_backend() == "cpu" else min(block, 64)
-    if isinstance(block, bool) or not isinstance(block, int | np.integer) or block < 1:
-        raise ValueError(f"block: expected an int >= 1, got {block!r}")
+    core.check_count("block", block, 1)
     return min(int(block), T)
 
 

@@ -213,7 +213,7 @@ def test_bad_arguments_are_refused():
     for bad, message in (
         ({"universe": 0.0}, "universe"),
         ({"universe": np.ones((2, 2))}, r"universe: expected shape \(d,\)"),
-        ({"sets": 1}, "sets: expected an integer >= 2"),
+        ({"sets": 1}, "sets: expected an int >= 2"),
         ({"corners": sets[:, ::-1]}, "corners: must be ordered, but set 0 of input 0"),
         ({"corners": sets[:2]}, "corners: no set of input 0 holds 8"),
         ({"corners": [[0, 0, 1, 2], [3, 4, 10, 10]]}, "corners: no set of input 0 holds 2"),

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, StepInput, bind
+from jaxfilt.core import Filter, Info, Prediction, Static, StepInput, bind, check_count
 from jaxfilt.filters.common import check_dtype, check_measurement
 from jaxfilt.filters.update import array_update, joseph_update
 from jaxfilt.linalg import chol, mirror, scale_cov, sym, tria
@@ -100,8 +100,7 @@ def init_mean(model: Nonlinear, inp: StepInput) -> Array:
 def _params(model, order, iterations, relinearize):
     if not isinstance(order, int) or order not in (1, 2):
         raise ValueError(f"order: expected 1 or 2, got {order!r}")
-    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations: expected an int >= 1, got {iterations!r}")
+    check_count("iterations", iterations, 1)
     if order == 2 and iterations > 1:
         raise ValueError(f"iterations: expected 1 with order=2, got {iterations}")
     if order == 2 and relinearize:

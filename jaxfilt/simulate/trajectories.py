@@ -77,8 +77,7 @@ def measure(model: LinearGaussian, states: Any, key: Array, *, dt: Any = None, u
 
 
 def _inputs(T, dtype, dt, u, key) -> StepInput:
-    if not isinstance(T, int) or T < 1:
-        raise ValueError(f"T: expected an int >= 1, got {T!r}")
+    core.check_count("T", T, 1)
     # The filter's own checks and keys; the measurement here only carries the length and the dtype.
     return core.inputs(jnp.zeros((T, 1), dtype), dt=dt, u=u, key=key)
 

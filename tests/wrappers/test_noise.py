@@ -584,7 +584,7 @@ def test_bad_arguments_are_refused():
         (lambda: jf.sage_husa(filt, prior=-1.0), "prior"),
         (lambda: jf.sage_husa(filt, bounds=(1.0,)), "bounds"),
         (lambda: jf.filter(jf.sage_husa(fixed), ys), "r_scale: the filter was made without r"),
-        (lambda: jf.covariance_matching(filt, window=1), "window: expected an integer >= 2"),
+        (lambda: jf.covariance_matching(filt, window=1), "window: expected an int >= 2"),
         (lambda: jf.covariance_matching(filt, bounds=(1.0, 0.5)), "bounds"),
         (lambda: jf.fading_memory(filt, 0.9), "factor: expected a value >= 1"),
         (lambda: jf.fading_memory(fixed), "fading_memory needs a filter with moments"),
