@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import gc
 import importlib
 import os
 import pkgutil
@@ -90,6 +91,7 @@ def run_all(jobs: Sequence[tuple[Experiment, Options]], out: Path, *, write_read
             traceback.print_exc()
             failed += 1
             outcome = "failed"
+        _release_programs()
         form = "quick" if options.quick else "full"
         rows.append([experiment.name, experiment.title, form, f"{time.perf_counter() - begun:.0f} s", outcome])
     total = time.perf_counter() - start
@@ -103,6 +105,14 @@ def run_all(jobs: Sequence[tuple[Experiment, Options]], out: Path, *, write_read
     (out / "report.md").write_text(text, encoding="utf-8")
     print(f"{table.text('simple')}\n\n{' '.join(summary)}\n{out / 'report.md'}")
     return 1 if failed else 0
+
+
+def _release_programs() -> None:
+    """Compiled programs hold memory maps, of which Linux gives a process 65530: a dozen experiments reach that."""
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
