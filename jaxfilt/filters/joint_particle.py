@@ -221,8 +221,8 @@ def _check_noise(models, rank):
     n = models[0][0].m0.shape[0]
     if rank is not None:
         core_check_count("noise_rank", rank, 1)
-    if rank is not None and rank > n:
-        raise ValueError(f"noise_rank: expected 1 to {n}, got {rank}")
+        if rank > n:
+            raise ValueError(f"noise_rank: expected 1 to {n}, got {rank}")
     for row in models:
         for model in row:
             if callable(model.Q) or not is_concrete(model.Q):
