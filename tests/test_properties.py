@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import typing
 
 import jax
@@ -253,6 +254,22 @@ def test_a_bad_value_is_flagged_and_other_runs_are_untouched(name, dtype):
         assert (np.asarray(a)[[0, 2]] == np.asarray(b)[[0, 2]]).all()
     with pytest.raises(ValueError, match=r"ys\[4, 0\] is nan"):
         jf.filter(example.make(params(example, dtype)), dirty_ys[1], **example.options)
+
+
+@every
+def test_a_traced_parameter_that_is_not_finite_leaves_no_silent_nan(name):
+    """Under ``jit`` nothing raises; each step is finite or has a status. The program is that of the tests above."""
+    example, dtype = REGISTRY[name], jnp.float64
+    leaves, tree = jax.tree.flatten(params(example, dtype))
+    ys = series(example, dtype, runs=3)
+    for i, bad in itertools.product(range(len(leaves)), (np.nan, np.inf, -1.0)):
+        x = np.array(leaves[i])
+        x.reshape(-1)[0] = bad
+        wrong = jax.tree.unflatten(tree, [*leaves[:i], jnp.asarray(x), *leaves[i + 1 :]])
+        out = compiled(name)(wrong, ys, mask_of(name), keys_of(name))
+        numbers = [np.asarray(x) for x in (out.mean, out.cov, out.log_lik) if x is not None]
+        finite = np.stack([np.isfinite(x).reshape(3, T, -1).all(axis=-1) for x in numbers]).all(axis=0)
+        assert (finite | (np.asarray(out.status) != 0)).all(), (i, bad)
 
 
 @every

@@ -134,7 +134,7 @@ def array_update(
     L_R = chol(decoupled(mask, R)) if chol_R is None or mask is not None else chol_R
     top = jnp.concatenate([masked_rows(mask, D), L_R], axis=1)
     bottom = jnp.concatenate([L, jnp.zeros((n, m), L.dtype)], axis=1)
-    array = tria(jnp.concatenate([top, bottom]))
+    array = tria(jnp.concatenate([top, bottom]), m)
     L_S, KL, L_new = array[:m, :m], array[m:, :m], array[m:, m:]
     whitened = solve_lower(L_S, nu)
     nis, log_lik, singular = likelihood(mask, L_S, whitened)

@@ -7,6 +7,8 @@ A pivot that is zero to working precision gives a zero column, and the solves sk
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +42,7 @@ def scale_cov(A: Array, scale: Array | None) -> Array:
     if jnp.ndim(scale) == 0:
         return A * scale
     d = _sqrt(scale)
-    return d[:, None] * A * d[None, :]
+    return d[:, None] * d[None, :] * A  # in this order it is as symmetric as A, to the bit
 
 
 def scale_factor(L: Array, scale: Array | None) -> Array:
@@ -54,7 +56,8 @@ def scale_factor(L: Array, scale: Array | None) -> Array:
 def chol(A: Array) -> Array:
     """Lower Cholesky factor of a positive semidefinite A (n, n).
 
-    A pivot below ``n eps |A_jj|`` counts as zero and gives a zero column: no NaN, and a finite gradient.
+    A pivot below ``n eps |A_jj|`` counts as zero and gives a zero column: no NaN, and a finite gradient. NaN and
+    infinity in A give NaN, so that a filter reports them.
     """
     n = A.shape[0]
     tolerance = n * jnp.finfo(A.dtype).eps * jnp.abs(jnp.diagonal(A))
@@ -64,7 +67,8 @@ def chol(A: Array) -> Array:
         pivot = rest[j, j]
         ok = pivot > tolerance[j]
         root = jnp.sqrt(jnp.where(ok, pivot, jnp.ones((), A.dtype)))
-        column = jnp.where(ok & (np.arange(n) >= j), rest[:, j] / root, jnp.zeros((), A.dtype))
+        nothing = jnp.where(np.arange(n) == j, pivot - pivot, jnp.zeros((), A.dtype))  # 0; of NaN and infinity NaN
+        column = jnp.where(ok & (np.arange(n) >= j), rest[:, j] / root, nothing)
         columns.append(column)
         if j < n - 1:
             rest = rest - column[:, None] * column[None, :]
@@ -86,32 +90,36 @@ def solve_chol(L: Array, b: Array) -> Array:
     return solve_lower_t(L, solve_lower(L, b))
 
 
-@jax.custom_jvp
-def tria(A: Array) -> Array:
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def tria(A: Array, summed: int = 0) -> Array:
     """The lower-triangular L (n, n) with L L' = A A' and a nonnegative diagonal, for A (n, k).
 
     Householder reflections from the right, with large rows best placed first (Powell and Reid 1969). A row that depends
     on the rows above it to working precision gets a zero pivot and its column stays free for the rows below, so that
     the whole column of L is zero and L L' = A A' still holds. The derivative is that of the triangular factor, exact
-    wherever the pivots are nonzero and finite everywhere.
+    wherever the pivots are nonzero and finite everywhere. NaN and infinity in A give NaN.
+
+    A pivot counts as zero below ``k eps`` times what reflections have moved in its row, at most the row's largest
+    entry: that is the rounding they leave. So a row keeps what it has apart from the others, however small. The first
+    ``summed`` rows are sums that may have cancelled before (H L): for them it is the largest entry.
     """
-    return _reflect(A, A.shape[0])
+    return _reflect(A, A.shape[0], summed)
 
 
 @tria.defjvp
-def _tria_jvp(primals, tangents):
+def _tria_jvp(summed, primals, tangents):
     # With A = L Q': dL = L (lower(C) + lower(C') without the diagonal twice), C = L^-1 dA Q. Written as dA Q minus its
     # part above the diagonal, which stays finite (and is cut) where a pivot is zero.
     (A,), (dA,) = primals, tangents
     n, k = A.shape
-    LQ = _reflect(jnp.concatenate([A, jnp.eye(k, dtype=A.dtype)]), n)
+    LQ = _reflect(jnp.concatenate([A, jnp.eye(k, dtype=A.dtype)]), n, summed)
     L, Q = LQ[:n], LQ[n:]
     dAQ = dA @ Q
     above = jnp.triu(solve_lower(L, dAQ), 1)
     return L, jnp.tril(dAQ - L @ (above - above.T))
 
 
-def _reflect(A, n):
+def _reflect(A, n, summed):
     """Reduces the first n rows of A (r, k) to lower-triangular form; all rows are reflected, n columns are returned."""
     r, k = A.shape
     if k < n:
@@ -122,19 +130,24 @@ def _reflect(A, n):
     columns, rows = np.arange(k), np.arange(r)[:, None]
     largest = jnp.max(jnp.abs(A[:n]), axis=1)
     free = jnp.ones((k,), bool)  # columns not yet taken by a pivot
+    moved = jnp.zeros((n,), A.dtype)  # the sum of what each row's columns that are left have been changed by
     signs = []
     for j in range(n):
         x = jnp.where(free, A[j], zero)
         size = jnp.max(jnp.abs(x))
-        ok = size > k * eps * largest[j]
+        ok = size > k * eps * (largest[j] if j < summed else jnp.minimum(moved[j], largest[j]))
         # Scaled before squaring, so that tiny units do not underflow.
-        scaled = jnp.where(ok, x / jnp.where(ok, size, one), jnp.where(columns == j, one, zero))
+        scaled = x / jnp.where(ok, size, jnp.inf)
+        scaled = jnp.where(~ok & (columns == j), one, scaled)
         norm = jnp.sqrt(jnp.sum(scaled * scaled))
         sign = jnp.where(scaled[j] > 0, -one, one)  # of the pivot: no cancellation in v
         v = scaled - jnp.where(columns == j, sign * norm, zero)
-        beta = jnp.where(ok, 2.0 / jnp.sum(v * v), zero)
-        reflected = A - (beta * (A @ v))[:, None] * v[None, :]
-        pivot_row = jnp.where(ok & (columns == j), sign * norm * size, jnp.where(free, zero, A[j]))
+        beta = jnp.where(ok, one / (norm * (norm + jnp.abs(scaled[j]))), zero)  # 2 / v'v
+        along = beta * (A @ v)
+        reflected = A - along[:, None] * v[None, :]
+        moved = moved + jnp.abs(along[:n]) * (jnp.abs(scaled) @ (columns != j).astype(A.dtype))
+        pivot = jnp.where(ok, sign * norm * size, size - size)  # 0; of NaN and infinity NaN
+        pivot_row = jnp.where(columns == j, pivot, jnp.where(free, zero, A[j]))
         A = jnp.where(rows > j, reflected, jnp.where(rows == j, pivot_row[None, :], A))
         free = free & ~(ok & (columns == j))
         signs.append(sign)

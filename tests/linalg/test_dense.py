@@ -80,6 +80,25 @@ def test_tria_leaves_the_mass_of_a_dependent_row_to_the_rows_below(dtype):
     np.testing.assert_allclose(L @ L.T, A @ A.T, atol=tol(dtype) * 10)
 
 
+@dtypes
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_tria_keeps_what_a_row_has_apart_however_small_and_only_that(dtype, unit):
+    """One update whose posterior is far below the prior (Bierman 1977), then one that leaves nothing (R = 0)."""
+    e = 2 * float(jnp.finfo(dtype).eps)
+    L = np.eye(2) / e
+    H = np.array([[1.0, e], [1.0, 1.0]])
+    array = jax.jit(linalg.tria, static_argnums=1)
+    A = jnp.asarray(unit * np.block([[H @ L, np.eye(2)], [L, np.zeros((2, 2))]]), dtype)
+    L_new = np.asarray(array(A, 2), float)[2:, 2:] / unit
+    np.testing.assert_allclose(L_new @ L_new.T, [[1, -1], [-1, 2]], rtol=20 * e)
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        L = np.tril(rng.normal(size=(3, 3))) * 10.0 ** rng.uniform(-3, 3, (3, 1))
+        A = jnp.asarray(unit * np.block([[L[:1], np.zeros((1, 1))], [L, np.zeros((3, 1))]]), dtype)
+        L_new = np.asarray(array(A, 1))[1:, 1:]
+        assert (L_new[0] == 0).all()  # the first state was measured exactly
+
+
 def test_tria_derivative_by_log_diagonal_and_triangular_solve():
     """Against the derivatives of slogdet and of a dense solve: R R' alone would not see a wrong skew part."""
     A = jnp.asarray(np.random.default_rng(3).normal(size=(3, 7)))
@@ -105,6 +124,19 @@ def test_tria_derivative_is_finite_at_zero_rows_and_columns(dtype):
         B = A.copy()
         B[zero] = 0
         assert np.isfinite(gradient(jnp.asarray(B, dtype))).all()
+
+
+@dtypes
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_nan_and_infinity_are_not_taken_for_a_zero_pivot(dtype, bad):
+    """A filter would go on with a variance of 0 and say nothing."""
+    for n in (1, 3):
+        A = np.eye(n, n)
+        for i in range(n):
+            B = A.copy()
+            B[i, i] = bad
+            assert np.isnan(np.asarray(chol(jnp.asarray(B, dtype)))).any()
+            assert np.isnan(np.asarray(tria(jnp.asarray(np.block([B, A]), dtype)))).any()
 
 
 def test_scales_act_as_a_diagonal_on_both_sides():

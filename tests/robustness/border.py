@@ -14,6 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
 import jaxfilt as jf
 from tests.examples import LINEAR
@@ -31,6 +33,8 @@ MODULES = {
     "fuzzy.": jf.fuzzy,
     "maneuver.": jf.maneuver,
     "sincos.": jf.sincos,
+    "plots.": jf.plots,
+    "frames.": jf.frames,
 }
 
 _CALLBACK = "an output function or constructor that the library calls with its own values, inside a step"
@@ -62,6 +66,7 @@ EXEMPT = {
     ),
     "gains.check_stable": "is itself a check, of gains together",
     "sincos.both_present": "is itself a check, of a mask",
+    **dict.fromkeys(("plots.pareto", "plots.tuning"), "takes results by position: test_plots.py has the bad ones"),
 }  # fmt: skip
 
 
@@ -150,6 +155,12 @@ def info():
 @functools.cache
 def particles():
     return jf.filter(jf.particle(model(), 8, keep=True), YS, key=KEY, outputs=jf.everything)
+
+
+@functools.cache
+def axes():
+    """One for all calls: a figure takes longer than what is drawn."""
+    return Figure().subplots()
 
 
 def space():
@@ -411,6 +422,26 @@ CALLS: dict[str, Callable[[], dict[str, Any]]] = {
                                   "share": 0.1},
     "sincos.check_parameters": lambda: {"parameters": jf.sincos.Parameters()},
     "sincos.mask_clipped": lambda: {"ys": CIRCLE, "low": -0.9, "high": 0.9},
+    "frames.from_frame": lambda: {"df": pd.DataFrame({"t": np.arange(4.0), "x": np.ones(4)}), "columns": ("x",),
+                                  "time": "t", "first": 1.0},
+    "frames.to_frame": lambda: {"out": info(), "index": None, "names": ("a", "b", "c")},
+    "frames.to_xarray": lambda: {"out": info(), "times": None, "names": ("a", "b", "c")},
+    "frames.status_text": lambda: {"status": np.zeros(4, np.int32)},
+    "plots.track": lambda: {"out": info(), "truth": STATES3, "measurements": YS, "mask": MASK, "components": (0, 1),
+                            "probability": 0.9, "ellipses": 3, "label": "a", "unit": "m", "ax": axes()},
+    "plots.estimate": lambda: {"out": info(), "component": 1, "truth": STATES3, "measurements": YS[:, 0],
+                               "mask": MASK, "times": np.arange(4.0), "sigmas": 2.0, "label": "a", "unit": "m",
+                               "ax": axes()},
+    "plots.errors": lambda: {"out": info(), "truth": STATES3, "components": (2,), "times": np.arange(4.0),
+                             "sigmas": 2.0, "names": None, "axes": axes()},
+    "plots.consistency": lambda: {"values": np.ones((3, 4)), "dof": 2.0, "probability": 0.9, "times": np.arange(4.0),
+                                  "label": "NIS", "ax": axes()},
+    "plots.mode_probabilities": lambda: {"probabilities": np.full((4, 2), 0.5), "names": None,
+                                         "truth": np.array([0, 1, 1, 0]), "times": np.arange(4.0), "ax": axes()},
+    "plots.memberships": lambda: {"before": np.array([[0.0, 0.0, 1.0, 2.0], [1.0, 2.0, 3.0, 3.0]]), "after": None,
+                                  "universe": 4.0, "names": None, "unit": "m", "ax": axes()},
+    "plots.monte_carlo": lambda: {"curves": {"a": np.ones((3, 4))}, "times": np.arange(4.0), "probability": 0.9,
+                                  "unit": "m", "ax": axes()},
     "sincos.mechanical": lambda: {"theta": np.zeros(4), "cycles": 2},
 }  # fmt: skip
 
@@ -456,6 +487,9 @@ def wrong(value: Any) -> Iterator[tuple[str, Any]]:
         yield from (("number", 3.5), ("array", np.ones((3, 3))), ("empty", ()), ("shorter", (value[0], Odd())))
         return
     a = np.asarray(value)
+    if a.dtype == object:
+        yield from (("number", 3.5), ("array", np.ones((3, 3))))
+        return
     yield from (("complex", a + 1j), ("empty", np.zeros((0,) * max(a.ndim, 1))), ("rank", a[None].repeat(2, 0)[None]))
     if a.ndim:
         yield "length", np.concatenate([a, a[..., -1:], a[..., -1:], a[..., -1:]], axis=-1)

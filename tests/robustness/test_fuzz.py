@@ -57,6 +57,13 @@ ACCEPTED: dict[tuple[str, str], tuple[str, str]] = {
     **{("sincos.calibrated", name): ("nan inf", "such a sample is not trusted") for name in ("mean", "cov")},
     ("sincos.mask_clipped", "ys"): ("nan", _MISSING),
     ("sincos.mask_clipped", "high"): ("inf", "no rail on this side"),
+    **{(f"plots.{name}", arg): ("nan", "what is not known leaves a gap in the picture")
+       for name, arg in (("track", "truth"), ("track", "measurements"), ("estimate", "truth"),
+                         ("estimate", "measurements"), ("errors", "truth"), ("consistency", "values"))},
+    ("plots.track", "unit"): ("text none", "any text will do, or none"),
+    **{(f"plots.{name}", arg): ("text", "any text will do")
+       for name, arg in (("track", "label"), ("estimate", "label"), ("estimate", "unit"),
+                         ("consistency", "label"), ("memberships", "unit"), ("monte_carlo", "unit"))},
 }  # fmt: skip
 
 # Failures that are known, by function and argument.
@@ -83,7 +90,10 @@ def _call(name, arguments) -> Any:
 
 def _numbers(result) -> list[np.ndarray]:
     leaves = [
-        leaf for leaf in jax.tree.leaves(result) if isinstance(leaf, bool | float | np.ndarray | np.generic | jax.Array)
+        leaf
+        for leaf in jax.tree.leaves(result)
+        if isinstance(leaf, bool | float | np.ndarray | np.generic | jax.Array)
+        and not (isinstance(leaf, np.ndarray) and leaf.dtype.kind == "O")
     ]
     arrays = [leaf for leaf in leaves if not jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key)]
     return [np.asarray(leaf) for leaf in arrays]
