@@ -19,6 +19,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tqdm.auto import tqdm
+
 from experiments.report import Options, Report, Table, environment_seconds, provenance
 
 ROOT = Path(__file__).parent
@@ -65,11 +67,14 @@ def _constants(path: Path) -> dict[str, object]:
 
 def run(experiment: Experiment, options: Options, *, write_readme: bool = False) -> Report:
     """Runs one experiment, prints its tables, writes its report and, if asked, its README."""
+    from jaxfilt.progress import everywhere
+
     start = time.perf_counter()
-    report = experiment.load()(options)
+    with everywhere():
+        report = experiment.load()(options)
     report.provenance = provenance(options, time.perf_counter() - start)
-    print(report.to_console())
-    print(f"report: {report.write(options.out) / 'report.md'}\n", flush=True)
+    _say(report.to_console())
+    _say(f"report: {report.write(options.out) / 'report.md'}\n")
     if write_readme:
         report.write_readme(experiment.directory / "README.md")
         report.write_headline(ROOT.parent / "README.md")
@@ -81,14 +86,16 @@ def run_all(jobs: Sequence[tuple[Experiment, Options]], out: Path, *, write_read
     start = time.perf_counter()
     rows = []
     failed = 0
-    for experiment, options in jobs:
+    for experiment, options in (bar := tqdm(jobs, unit="experiment", disable=None)):
         begun = time.perf_counter()
-        print(f"{experiment.name} ({'quick' if options.quick else 'full'}) ...", flush=True)
+        bar.set_description(experiment.name)
+        _say(f"{experiment.name} ({'quick' if options.quick else 'full'}) ...")
         try:
             run(experiment, options, write_readme=write_readme)
             outcome = f"[report]({experiment.name}/report.md)"
         except Exception:
-            traceback.print_exc()
+            with tqdm.external_write_mode(file=sys.stderr):
+                traceback.print_exc()
             failed += 1
             outcome = "failed"
         _release_programs()
@@ -105,6 +112,12 @@ def run_all(jobs: Sequence[tuple[Experiment, Options]], out: Path, *, write_read
     (out / "report.md").write_text(text, encoding="utf-8")
     print(f"{table.text('simple')}\n\n{' '.join(summary)}\n{out / 'report.md'}")
     return 1 if failed else 0
+
+
+def _say(text: str) -> None:
+    """Prints above the progress bars."""
+    tqdm.write(text)
+    sys.stdout.flush()
 
 
 def _release_programs() -> None:

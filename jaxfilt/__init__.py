@@ -1,14 +1,17 @@
 """jaxfilt: recursive state estimators for JAX."""
 
+from jaxfilt import frames as frames
 from jaxfilt import fuzzy as fuzzy
 from jaxfilt import initial as initial
 from jaxfilt import linalg as linalg
 from jaxfilt import maneuver as maneuver
 from jaxfilt import metrics as metrics
 from jaxfilt import models as models
+from jaxfilt import plots as plots
 from jaxfilt import simulate as simulate
 from jaxfilt import sincos as sincos
 from jaxfilt import tune as tune
+from jaxfilt._version import __version__ as __version__
 from jaxfilt.batching import batch as batch
 from jaxfilt.batching import use_cores as use_cores
 from jaxfilt.core import Filter as Filter

@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt import checkpointed
+from jaxfilt import checkpointed, describe
 from jaxfilt.linalg import entries, scalar_scan, structure
 
 PyTree = Any
@@ -60,6 +60,10 @@ class Prediction(NamedTuple):
     cov: Array | None = None  # (n, n)
     cross: Array | None = None  # (n, n) Cov(x_{k-1}, x_k | y_1..k-1)
 
+    def __repr__(self) -> str:
+        """Shapes."""
+        return describe.fields(self)
+
 
 class Info(NamedTuple):
     """What one may want to look at after a step. A quantity that a filter does not define is None, never NaN or 0."""
@@ -75,6 +79,10 @@ class Info(NamedTuple):
     prediction: Prediction | None = None  # filled in by step, never by a filter
     extra: dict[str, PyTree] = {}  # the filter's own outputs; wrappers add keys  # noqa: RUF012
 
+    def __repr__(self) -> str:
+        """Shapes, how often each status bit is set, and the sum of the log-likelihood."""
+        return describe.info(self, Status)
+
 
 class Filter(NamedTuple):
     """A recursive estimator; each field is a ``jax.tree_util.Partial`` of a module-level function (:func:`bind`)."""
@@ -84,6 +92,10 @@ class Filter(NamedTuple):
     update: Callable[[PyTree, StepInput], tuple[PyTree, Info]]
     moments: Callable[[PyTree], tuple[Array, Array]] | None = None  # state -> (mean, cov)
     with_moments: Callable[[PyTree, Array, Array], PyTree] | None = None  # state with its moments replaced
+
+    def __repr__(self) -> str:
+        """Where it is defined, and its parameters: numbers, or shapes."""
+        return describe.filter_fields(self)
 
 
 @jax.tree_util.register_static
@@ -343,6 +355,9 @@ def mask_nan(ys: Any) -> tuple[Array, Array]:
 def intervals(times: Any, *, first: float) -> Array:
     """Intervals ``dt (T,)`` of increasing time stamps (T,); ``first`` is the one before the first sample.
 
+    Whole numbers give floats of JAX's default dtype. Concrete time stamps are subtracted in float64: in float32 seconds
+    since 1970 come in steps of 128.
+
     Raises:
         ValueError: if the (concrete) time stamps do not increase.
     """
@@ -350,13 +365,17 @@ def intervals(times: Any, *, first: float) -> Array:
         if is_concrete(x) and numbers(name, x).ndim != len(shape) // 4:
             raise ValueError(f"{name}: expected shape {shape}, got {np.shape(x)}")
     if is_concrete(times):
-        stamps = np.asarray(times, np.float64)
+        times = np.asarray(times)
+        stamps = times.astype(np.float64)
         increases = stamps[1:] > stamps[:-1]  # false for NaN too
         if not increases.all():
             k = int(np.argmin(increases)) + 1
             raise ValueError(f"times: must increase, but times[{k}] <= times[{k - 1}]")
-    times = jnp.asarray(times)
-    return jnp.concatenate([jnp.full((1,), first, times.dtype), jnp.diff(times)])
+        differences = np.diff(stamps)
+    else:
+        differences = jnp.diff(times)
+    dtype = jax.dtypes.canonicalize_dtype(times.dtype if jnp.issubdtype(times.dtype, jnp.floating) else float)
+    return jnp.concatenate([jnp.full((1,), first, dtype), jnp.asarray(differences, dtype)])
 
 
 def inputs(

@@ -20,13 +20,14 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt import core, metrics
+from jaxfilt import core, describe, metrics
 from jaxfilt.batching import in_parts
 from jaxfilt.checkpoint import Store, stored_chunk
 from jaxfilt.core import Filter, PyTree, Static, Status, aspartial
 from jaxfilt.linalg import structure
 from jaxfilt.metrics import Estimate
 from jaxfilt.models.linear import LinearGaussian, check_linear
+from jaxfilt.progress import maker
 from jaxfilt.simulate import simulate
 
 # More runs in one call cost memory and save nothing: from 256 to 16384 the processor time per run is the same.
@@ -43,6 +44,10 @@ class Draw(NamedTuple):
     dt: Array | None = None  # likewise
     u: PyTree = None  # likewise
 
+    def __repr__(self) -> str:
+        """Shapes."""
+        return describe.fields(self)
+
 
 class Scenario(NamedTuple):
     """What is simulated and what the filters are told. Build the common case with :func:`scenario`.
@@ -56,6 +61,10 @@ class Scenario(NamedTuple):
     dt: Any = None
     u: PyTree = None
     first_update_only: bool = False  # static
+
+    def __repr__(self) -> str:
+        """What simulates, and the inputs by shape."""
+        return describe.fields(self)
 
 
 class MonteCarloResult(NamedTuple):
@@ -72,6 +81,10 @@ class MonteCarloResult(NamedTuple):
     def runs_per_second(self) -> float:
         """Runs per second of the computation, each with all filters."""
         return self.runs / self.wall_seconds
+
+    def __repr__(self) -> str:
+        """Each filter's scores as mean and standard error over runs, its status bits, and the speed."""
+        return describe.monte_carlo(self, Status)
 
     def mean(self, filt: str, score: str) -> Estimate:
         """Mean of a score over runs with its standard error."""
@@ -188,7 +201,7 @@ def monte_carlo(
     filters = dict(filters)
     for name, filt in filters.items():
         core.check_filter(filt, f"filters[{name!r}]")
-    tqdm = _import_tqdm() if progress else None
+    make_bar = maker(progress)
     devices = tuple(jax.local_devices() if devices is None else devices)
 
     started = time.perf_counter()
@@ -218,7 +231,7 @@ def monte_carlo(
     tree = jax.tree.structure(lowered.out_info)
     parts: list[Any] = []
     pending: tuple[Any, int] | None = None
-    with tqdm(total=runs, unit="run", unit_scale=True) if tqdm else contextlib.nullcontext() as bar:
+    with make_bar(total=runs, unit="run", unit_scale=True) if make_bar else contextlib.nullcontext() as bar:
         for first in range(chunk * jax.process_index(), stride * math.ceil(runs / stride), stride):
             found = None if store is None else store.load(first, tree)
             result = (compiled(job, indices + np.uint32(first)) if found is None else found), first
@@ -332,11 +345,3 @@ def _of_all_processes(stacked):
 def _in_order(x, runs):
     x = np.swapaxes(x, 0, 1)
     return x.reshape(-1, *x.shape[3:])[:runs]
-
-
-def _import_tqdm():
-    try:
-        from tqdm.auto import tqdm
-    except ImportError:
-        raise ImportError("progress=True needs tqdm: pip install 'jaxfilt[progress]'") from None
-    return tqdm

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt import core
+from jaxfilt import core, describe
 from jaxfilt.core import Filter, Info
 from jaxfilt.linalg import chol, solve_chol, sym
 
@@ -18,6 +18,10 @@ class Smoothed(NamedTuple):
 
     mean: Array  # (T, n)
     cov: Array  # (T, n, n)
+
+    def __repr__(self) -> str:
+        """Shapes."""
+        return describe.fields(self)
 
 
 def rts(out: Info) -> Smoothed:

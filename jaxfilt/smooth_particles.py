@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt import core
+from jaxfilt import core, describe
 from jaxfilt.core import Info, PyTree, Status, flag
 from jaxfilt.filters.particle import log_density, weighted
 from jaxfilt.linalg import chol, scale_cov
@@ -26,6 +26,10 @@ class SmoothedParticles(NamedTuple):
     particles: Array  # (T, N, n); with paths, particles[:, i] is a draw of the whole trajectory
     log_weights: Array  # (T, N), normalized
     status: Array  # (T,) int32: SINGULAR where the step to k + 1 has no transition density
+
+    def __repr__(self) -> str:
+        """Shapes."""
+        return describe.fields(self)
 
 
 def smooth_particles(

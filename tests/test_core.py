@@ -63,6 +63,12 @@ def test_mask_nan_is_an_explicit_choice():
 
 def test_intervals_of_time_stamps():
     np.testing.assert_allclose(jf.intervals(np.array([3.0, 4.0, 6.5]), first=0.5), [0.5, 1.0, 2.5])
+    whole = jf.intervals([3, 4, 6], first=1)
+    assert whole.dtype == np.float64  # jf.filter takes floats
+    np.testing.assert_array_equal(whole, [1, 1, 2])
+    np.testing.assert_array_equal(jax.jit(jf.intervals)(jnp.array([3, 4, 6]), first=1.0), whole)
+    with jax.enable_x64(False):  # float32 holds no date to the second
+        np.testing.assert_array_equal(jf.intervals(1.7e9 + np.array([0.0, 1.0, 3.5]), first=1.0), [1.0, 1.0, 2.5])
     for times in ([0.0, 1.0, 1.0], [0.0, 1.0, 0.5]):
         with pytest.raises(ValueError, match=r"times: must increase, but times\[2\] <= times\[1\]"):
             jf.intervals(np.array(times), first=1.0)

@@ -96,6 +96,14 @@ def test_one_failure_does_not_stop_the_others_and_is_not_hidden(root, capsys):
     assert Path("results/bravo/report.md").is_file()
 
 
+def test_bars_are_for_terminals(root, capsys, monkeypatch):
+    assert cli.main(["run", "all", "--quick"]) == 0
+    assert "experiment/s" not in capsys.readouterr().err
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert cli.main(["run", "all", "--quick"]) == 0
+    assert "bravo: 100%" in capsys.readouterr().err
+
+
 def test_write_readme_publishes(root, capsys):
     readme = root / "bravo" / "README.md"
     readme.write_text("<!-- table: gap -->\n<!-- /table: gap -->\n", encoding="utf-8")

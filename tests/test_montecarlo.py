@@ -306,7 +306,7 @@ def test_the_progress_bar_counts_runs(capsys, monkeypatch):
     run(100, KEY, chunk=32, progress=True)
     assert "100/100" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "tqdm.auto", None)
-    with pytest.raises(ImportError, match=r"pip install 'jaxfilt\[progress\]'"):
+    with pytest.raises(ImportError, match=r'pip install "jaxfilt\[progress\]"'):
         run(100, KEY, chunk=32, progress=True)
 
 

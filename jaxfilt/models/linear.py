@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxfilt import describe
 from jaxfilt.core import PyTree, aspartial, is_concrete, numbers
 from jaxfilt.linalg.structure import array, diagonal, repeat
 
@@ -32,6 +33,10 @@ class LinearGaussian(NamedTuple):
     B: Matrix | None = None  # (n, p), or a function that gives the whole input term (n,)
     D: Matrix | None = None  # (m, p), or a function that gives the whole input term (m,)
     S: Matrix | None = None  # (n, m) Cov(w_{k+1}, v_k)
+
+    def __repr__(self) -> str:
+        """Matrices by shape, small ones and functions by their numbers."""
+        return describe.fields(self)
 
 
 def linear_gaussian(

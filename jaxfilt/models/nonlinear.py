@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import Partial
 
+from jaxfilt import describe
 from jaxfilt.core import PyTree, aspartial
 from jaxfilt.linalg.structure import array
 from jaxfilt.models.linear import (
@@ -38,6 +39,10 @@ class Nonlinear(NamedTuple):
     f_jacobian: Function | None = None  # (n, n); None = by automatic differentiation
     h_jacobian: Function | None = None  # (m, n)
 
+    def __repr__(self) -> str:
+        """Functions with what they hold, matrices by shape."""
+        return describe.fields(self)
+
 
 class Sensor(NamedTuple):
     """A measurement function with its noise and the way its residuals wrap."""
@@ -45,6 +50,10 @@ class Sensor(NamedTuple):
     h: Function
     R: Array | Function  # (m, m); takes the motion model's float dtype where it has none of its own
     residual: Callable[[Array, Array], Array] | None = None
+
+    def __repr__(self) -> str:
+        """The functions with what they hold."""
+        return describe.fields(self)
 
 
 def nonlinear(

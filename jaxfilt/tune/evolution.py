@@ -15,8 +15,9 @@ from jax import Array
 from jaxfilt.core import aspartial, check_count, check_key, numbers
 from jaxfilt.linalg import structure
 from jaxfilt.models.linear import check_finite
+from jaxfilt.progress import rounds
 from jaxfilt.tune import params as spaces
-from jaxfilt.tune.result import Front, TuneResult, check_time_limit, make_result, rounds
+from jaxfilt.tune.result import Front, TuneResult, check_time_limit, make_result
 
 PyTree = Any
 

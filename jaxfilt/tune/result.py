@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfilt import describe
 from jaxfilt.core import number
 
 PyTree = Any
@@ -20,12 +21,20 @@ class History(NamedTuple):
     wall_time: np.ndarray  # (h,) seconds up to here, compilation excluded
     best_loss: np.ndarray  # (h,) lowest loss up to here
 
+    def __repr__(self) -> str:
+        """From the first to the last row."""
+        return describe.history(self)
+
 
 class Front(NamedTuple):
     """Mutually non-dominated solutions."""
 
     losses: np.ndarray  # (k, objectives)
     params: PyTree  # leaves with a leading k, in their own constraints
+
+    def __repr__(self) -> str:
+        """How many, the range of each loss, and the parameters by shape."""
+        return describe.front(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +67,12 @@ class TuneResult:
         return float(self.history.best_loss[rows - 1]) if rows else float("inf")
 
     def __repr__(self) -> str:
-        """One line: method, loss, cost and parameters."""
+        """In short: method, loss, cost and parameters."""
         front = "" if self.front is None else f", front of {len(self.front.losses)}"
         return (
             f"TuneResult({self.method}: loss {self.loss:.6g} after {self.evaluations} evaluations in "
-            f"{self.wall_time:.3g} s, compilation {self.compile_time:.3g} s{front}, params={self.params})"
+            f"{self.wall_time:.3g} s, compilation {self.compile_time:.3g} s{front}, "
+            f"params={describe.brief(self.params)})"
         )
 
 
@@ -84,18 +94,3 @@ def check_time_limit(time_limit: Any) -> None:
     """Raises an error that names ``time_limit`` if it is neither None nor a number >= 0."""
     if time_limit is not None and not number("time_limit", time_limit) >= 0:
         raise ValueError(f"time_limit: expected seconds >= 0, got {time_limit}")
-
-
-def rounds(total: int, method: str, progress: bool) -> Iterable[int]:
-    """``range(total)``, with a progress bar if wanted.
-
-    Raises:
-        ImportError: if the bar is wanted and tqdm is missing.
-    """
-    if not progress:
-        return range(total)
-    try:
-        from tqdm.auto import tqdm
-    except ImportError as error:
-        raise ImportError('progress=True needs tqdm: pip install "jaxfilt[progress]"') from error
-    return tqdm(range(total), desc=method)

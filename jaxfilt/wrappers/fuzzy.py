@@ -171,7 +171,7 @@ def fuzzy_noise_parameters(
     widths = np.broadcast_to(segment / 4, gaps.shape)
     log_alpha = np.log(np.asarray(alpha, np.float64))
     try:
-        dtype = np.dtype(float if dtype is None else dtype)
+        dtype = np.dtype(jnp.result_type(float) if dtype is None else dtype)
     except TypeError:
         raise TypeError(f"dtype: expected a float dtype, got {dtype!r}") from None
     if not jnp.issubdtype(dtype, jnp.floating):

@@ -1,0 +1,1 @@
+"""What ``python -m jaxfilt`` is made of: files in, filters learnt from them, reports out."""
