@@ -13,12 +13,13 @@ export JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS = 0.2
 # Monte-Carlo tests run no slower). `make test-all` compiles as users do. The flags are those of the jax that is locked.
 QUICKLY = XLA_FLAGS='--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false'
 
-.PHONY: help env reproduce reproduce-all test test-all lint format lock clean
+.PHONY: help env reproduce reproduce-all test test-all docs docs-short lint format lock clean
 
 help:
 	@echo 'make reproduce      the main job at full size, the other experiments in their quick form; writes results/'
 	@echo 'make reproduce-all  every experiment at its published size'
 	@echo 'make test           the tests            make test-all   the slow ones too'
+	@echo 'make docs           executes the notebooks and builds the site (docs-short: small notebooks)'
 	@echo 'make lint           ruff and pyright     make format     ruff, mending what it can'
 	@echo 'make env            only the environment, .venv'
 	@echo 'make lock           the newest packages into requirements.lock'
@@ -47,6 +48,14 @@ test: env
 test-all: env
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'slow or not slow'
 
+docs: env
+	$(BIN)/python docs/run_notebooks.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+docs-short: env
+	$(BIN)/python docs/run_notebooks.py --short
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 lint: env
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -65,5 +74,5 @@ lock:
 	rm -rf build/lock
 
 clean:
-	rm -rf $(VENV) .jax_cache results build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .jax_cache results site build dist .pytest_cache .ruff_cache .hypothesis
 	find jaxfilt experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
