@@ -19,7 +19,8 @@ _ADVICE = {
     Status.NONFINITE: "a measurement or an estimate was NaN or infinite; mark missing samples with "
     "ys, mask = jf.mask_nan(ys), and look at the model's functions at the estimate before this step",
     Status.BOUND: "a value was capped at its bound: a negative dt, an infeasible theta, a scale outside its limits",
-    Status.LOW_ESS: "few particles carry the weight; take more of them, a guided proposal, or a larger R",
+    Status.LOW_ESS: "few particles carry the weight, and they are resampled; if that is so in most steps, take more of "
+    "them, a guided proposal, or a larger R",
     Status.PSEUDO: "a pseudo-measurement stood in for a missing sample",
 }
 
@@ -36,7 +37,7 @@ def check(
     out: Output,
     *,
     error: Status = Status.NONFINITE,
-    warn: Status = Status.SINGULAR | Status.BOUND | Status.LOW_ESS,
+    warn: Status = Status.SINGULAR | Status.BOUND,
 ) -> Output:
     """Raises or warns if a run's status has one of these bits; returns ``out`` otherwise, so that it can stand in line.
 
@@ -47,7 +48,7 @@ def check(
         out: what :func:`jaxfilt.filter` returned, of one run (T,) or of a batch (B, T); a
             :class:`jaxfilt.MonteCarloResult`; or anything else with ``status``, or a status array.
         error: bits that raise.
-        warn: bits that warn.
+        warn: bits that warn. LOW_ESS is none of them by default: a particle filter that resamples now and then is well.
 
     Raises:
         FilterError: one of the bits ``error`` occurred.

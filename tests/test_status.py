@@ -23,12 +23,12 @@ def words(*steps, T=5):
 
 
 def test_nothing_to_say():
-    """And what is ordinary says nothing: missing samples, refused ones, pseudo-measurements."""
+    """And what is ordinary says nothing: missing samples, refused ones, pseudo-measurements, particles resampled."""
     out = jf.filter(jf.kalman(MODEL), np.ones((5, 1)), mask=np.array([True, False, True, True, True]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert jf.check(out) is out
-        jf.check(words((1, Status.GATED), (2, Status.PSEUDO)))
+        jf.check(words((1, Status.GATED), (2, Status.PSEUDO), (3, Status.LOW_ESS)))
 
 
 @pytest.mark.parametrize("bit", list(Status))

@@ -17,7 +17,7 @@ from jaxfilt.cli.units import BadInput
 from jaxfilt.metrics import chi2_region, consistency, whiteness
 
 # The samples without a measurement are counted by themselves: a filter that is told of them is not in trouble.
-_TROUBLE = jf.Status.SINGULAR | jf.Status.NONFINITE | jf.Status.BOUND | jf.Status.LOW_ESS | jf.Status.GATED
+_TROUBLE = jf.Status.SINGULAR | jf.Status.NONFINITE | jf.Status.BOUND | jf.Status.GATED
 
 
 class Run(NamedTuple):
