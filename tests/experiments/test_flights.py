@@ -74,7 +74,7 @@ def test_training_pieces_hide_a_gap_of_every_length():
         assert sorted(np.diff(edges)[::2]) == list(flight_gaps.LENGTHS)
 
 
-@pytest.mark.parametrize("name", ["coast", "fit_ci N10 p1", "blend"])
+@pytest.mark.parametrize("name", ["coast", "fit_ci N10 p1", pytest.param("blend", marks=pytest.mark.slow)])
 def test_no_estimate_has_seen_a_hidden_fix(windows, name):
     """Whatever stands behind the mask, the estimates are the same to the last bit."""
     garbage = np.where(windows.mask[..., None], windows.ys, 1e6)
@@ -114,6 +114,7 @@ def test_coasting_over_the_real_dropout_gets_ever_less_certain(windows):
     assert (np.diff(variance) > 0).all()
 
 
+@pytest.mark.slow  # `make reproduce` runs it too
 def test_quick_form_gives_finite_tables_and_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(flights, "learn", _no_learning)
     tables, figures, findings = flights.flights(Options(out=tmp_path, quick=True))

@@ -147,6 +147,7 @@ def test_published_tables_agree_with_a_rerun(each, params):
     assert compare(published, Report("radar", "", tables)) == []
 
 
+@pytest.mark.slow  # `make reproduce` runs it too
 def test_quick_form_gives_finite_tables_and_a_figure(tmp_path):
     report = run.run(Options(out=tmp_path, quick=True))
     for table in report.tables:
