@@ -275,7 +275,7 @@ def scan(
     check_filter(filt)
     if not isinstance(inputs, StepInput):
         raise TypeError(f"inputs: expected a stacked StepInput, got {type(inputs).__name__}")
-    segment = _check_options(outputs, keep, segment, inputs)
+    segment = _check_options(outputs, keep, segment, first_update_only, inputs)
     return _scan(filt, state, inputs, outputs, keep, segment, first_update_only)
 
 
@@ -338,7 +338,7 @@ def filter(
     if form not in ("auto", "dense", "scalar"):
         raise ValueError(f'form: expected "auto", "dense" or "scalar", got {form!r}')
     scalar = form == "scalar" or (form == "auto" and _runs((filt, stacked)) >= _FEW)
-    segment = _check_options(outputs, keep, segment, stacked)
+    segment = _check_options(outputs, keep, segment, first_update_only, stacked)
     labels = structure.of(filt) if scalar else None
     return _filter(filt, stacked, key, outputs, keep, segment, first_update_only, form, labels)
 
@@ -478,8 +478,9 @@ def _is_first(stacked, first_update_only):
     return jnp.arange(stacked.y.shape[0]) == 0 if first_update_only else None
 
 
-def _check_options(outputs, keep, segment, stacked):
+def _check_options(outputs, keep, segment, first_update_only, stacked):
     check_callable("outputs", outputs)
+    check_flag("first_update_only", first_update_only)
     if keep not in ("stack", "sum", "last"):
         raise ValueError(f'keep: expected "stack", "sum" or "last", got {keep!r}')
     return None if segment is None else checkpointed.check_segment(segment, stacked.y.shape[0])
@@ -539,6 +540,12 @@ def check_count(name: str, value: Any, least: int) -> None:
     """Raises a ValueError that names an option if it is no integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: expected an int >= {least}, got {value!r}")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raises a TypeError that names a static option if it is neither True nor False: text and numbers are true, too."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name}: expected True or False, got {value!r}")
 
 
 def numbers(name: str, x: Any) -> np.ndarray:

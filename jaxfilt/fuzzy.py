@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Static, check_count, check_float, is_concrete, numbers
+from jaxfilt.core import Static, check_count, check_flag, check_float, is_concrete, numbers
 from jaxfilt.models.linear import check_finite, check_positive
 
 _POINTS = 1001  # of the output's universe, over which the centroid is taken
@@ -245,6 +245,7 @@ def triangles(levels: int = 4, output_range: tuple[float, float] = (0.0, 100.0),
         inner: peaks inside instead, at ``1 / (levels + 1), 2 / (levels + 1), ...`` of the range: nothing is cut.
     """
     check_count("levels", levels, 2)
+    check_flag("inner", inner)
     low, high = _check_range(output_range)
     place = np.arange(levels)
     if inner:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import PyTree, Status, StepInput, flag, inputs
+from jaxfilt.core import PyTree, Status, StepInput, check_flag, flag, inputs
 from jaxfilt.linalg import chol, solve_chol, solve_lower
 from jaxfilt.metrics.cramer_rao import condition, inverse_information
 from jaxfilt.models.linear import (
@@ -100,6 +100,7 @@ def batch_ml(
     """
     check_count("iterations", iterations, 1)
     check_positive("damping", damping, scalar=True)
+    check_flag("first_update_only", first_update_only)
     model = as_nonlinear(model)
     dtype = model.m0.dtype
     n = model.m0.shape[0]
@@ -144,6 +145,7 @@ def cost(
     model = as_nonlinear(model)
     if not isinstance(stacked, StepInput):
         raise TypeError(f"stacked: expected a StepInput, got {type(stacked).__name__}")
+    check_flag("first_update_only", first_update_only)
     common_dtype({"x0": x0, "m0": model.m0})
     check_shape("x0", x0, model.m0.shape)
     if prior is not None and (not isinstance(prior, tuple | list) or len(prior) != 2):

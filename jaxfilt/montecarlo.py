@@ -133,6 +133,7 @@ def scenario(
     """
     check_linear(model)
     core.check_count("T", T, 1)
+    core.check_flag("first_update_only", first_update_only)
     shared = core.inputs(np.zeros((T, 1), model.m0.dtype), dt=dt, u=u)
     draw = Partial(_draw_from_model, model, Static((T, first_update_only)), shared.dt, shared.u)
     return Scenario(draw, mask, shared.dt, shared.u, first_update_only)
@@ -194,6 +195,7 @@ def monte_carlo(
     if not core.number("memory_limit", memory_limit) > 0:
         raise ValueError(f"memory_limit: expected bytes > 0, got {memory_limit}")
     core.check_callable("outputs", outputs)
+    core.check_flag("progress", progress)
     if not isinstance(scenario, Scenario):
         raise TypeError(f"scenario: expected a Scenario, got {type(scenario).__name__}")
     if not isinstance(filters, Mapping) or not filters:

@@ -73,6 +73,7 @@ def filter_parallel(
     """
     check_linear(model)
     core.check_callable("outputs", outputs)
+    core.check_flag("first_update_only", first_update_only)
     stacked = core.inputs(ys, mask=mask, dt=dt, u=u, q_scale=q_scale, r_scale=r_scale)
     block = _block(block, stacked.y.shape[0])
     return _filter(model, stacked, outputs, first_update_only, block, _associative(associative), structure.of(model))
@@ -110,7 +111,10 @@ def _block(block, T):
 
 
 def _associative(given):
-    return jax.default_backend() != "cpu" if given is None else bool(given)
+    if given is None:
+        return jax.default_backend() != "cpu"
+    core.check_flag("associative", given)
+    return given
 
 
 @partial(jax.jit, static_argnames=("outputs", "first_update_only", "block", "associative", "labels"))

@@ -80,8 +80,9 @@ def test_one_mask_entry_per_sample_covers_all_components():
     np.testing.assert_array_equal(a.mean, b.mean)
 
 
-def test_first_update_only_takes_the_prior_on_the_first_sample():
-    out = jf.filter(KALMAN, YS, first_update_only=True, outputs=jf.everything)
+@pytest.mark.parametrize("flag", [True, np.True_])
+def test_first_update_only_takes_the_prior_on_the_first_sample(flag):
+    out = jf.filter(KALMAN, YS, first_update_only=flag, outputs=jf.everything)
     np.testing.assert_array_equal(out.prediction.mean[0], MODEL.m0)
     np.testing.assert_array_equal(out.prediction.cov[0], MODEL.P0)
     np.testing.assert_allclose(out.cov[0, 0, 0], 1 / (1 + 1 / 25.0), rtol=1e-14)

@@ -23,7 +23,20 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, StepInput, bind, flag, is_concrete, numbers, present
+from jaxfilt.core import (
+    Filter,
+    Info,
+    Prediction,
+    Static,
+    Status,
+    StepInput,
+    bind,
+    check_flag,
+    flag,
+    is_concrete,
+    numbers,
+    present,
+)
 from jaxfilt.filters.common import check_dtype, check_measurement
 from jaxfilt.filters.update import joseph_update
 from jaxfilt.linalg import rotation, scale_cov, skew, sym
@@ -286,6 +299,7 @@ def _build(
     sign = check_frame(frame)
     if prop not in ("exact", "euler"):
         raise ValueError(f'prop: expected "exact" or "euler", got {prop!r}')
+    check_flag("project_cov", project_cov)
     for name, x in {"dt": dt, "gravity": gravity, "gyro_var": gyro_var, "acc_var": acc_var}.items():
         check_positive(name, x)
     check_positive("bias_var" if bias_q is None else "bias_q", bias_var if bias_q is None else bias_q)
@@ -298,7 +312,7 @@ def _build(
         check_covariance("P0", P0)
     p = _Params(
         dt, sign * gravity, gyro_var, acc_var, bias_var if bias_q is None else None, bias_q, kappa, trust, velocity_var,
-        z0, P0, bias_limit, Static(_Options(prop == "exact", bool(project_cov))),
+        z0, P0, bias_limit, Static(_Options(prop == "exact", project_cov)),
     )  # fmt: skip
     check_positive("bias_var", bias_var)
     parameters = {**p._replace(trust=None, options=None)._asdict(), **(named or {})}

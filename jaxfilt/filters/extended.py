@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, StepInput, bind, check_count
+from jaxfilt.core import Filter, Info, Prediction, Static, StepInput, bind, check_count, check_flag
 from jaxfilt.filters.common import check_dtype, check_measurement
 from jaxfilt.filters.update import array_update, joseph_update
 from jaxfilt.linalg import chol, mirror, scale_cov, sym, tria
@@ -101,12 +101,13 @@ def _params(model, order, iterations, relinearize):
     if not isinstance(order, int) or order not in (1, 2):
         raise ValueError(f"order: expected 1 or 2, got {order!r}")
     check_count("iterations", iterations, 1)
+    check_flag("relinearize", relinearize)
     if order == 2 and iterations > 1:
         raise ValueError(f"iterations: expected 1 with order=2, got {iterations}")
     if order == 2 and relinearize:
         raise ValueError("relinearize: expected False with order=2")
     model = as_nonlinear(model)
-    return _Params(model, Static(order), Static(iterations), Static(bool(relinearize)))
+    return _Params(model, Static(order), Static(iterations), Static(relinearize))
 
 
 def _linearize(fn, given, mean, P, inp, order, noise):

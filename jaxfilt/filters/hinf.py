@@ -9,7 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, check_count, flag, is_concrete, numbers
+from jaxfilt.core import (
+    Filter,
+    Info,
+    Prediction,
+    Static,
+    Status,
+    bind,
+    check_count,
+    check_flag,
+    flag,
+    is_concrete,
+    numbers,
+)
 from jaxfilt.filters.kalman import init_mean, measurement, propagate
 from jaxfilt.filters.kalman import input_term as _input
 from jaxfilt.filters.update import array_update, joseph_update
@@ -219,6 +231,7 @@ def _make(model, theta2, weight, stationary, output, infeasible, square_root):
         raise ValueError(f'output: expected "corrected", "posterior" or "pred", got {output!r}')
     if infeasible not in ("cap", "nan"):
         raise ValueError(f'on_infeasible: expected "cap" or "nan", got {infeasible!r}')
+    check_flag("stationary", stationary)
     check_linear(model)
     if model.S is not None:
         raise ValueError("model: noise correlated between process and measurement (S) is not covered")

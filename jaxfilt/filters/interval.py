@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, flag, is_concrete
+from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, check_flag, flag, is_concrete
 from jaxfilt.filters.common import check_dtype, check_measurement, innovate
 from jaxfilt.models.linear import check_finite, check_shape, common_dtype
 
@@ -114,9 +114,10 @@ def interval_observer(
         check_shape("B", a["B"], (n, None))
     for name, x in a.items():
         check_finite(name, x)
+    check_flag("nonnegative", nonnegative)
     if is_concrete(a):
         _check({name: np.asarray(x) for name, x in a.items()}, nonnegative)
-    params = _Params(**{"B": None, **a}, nonnegative=Static(bool(nonnegative)))
+    params = _Params(**{"B": None, **a}, nonnegative=Static(nonnegative))
     return bind(params, _init, _predict, _update)
 
 

@@ -19,6 +19,7 @@ from jaxfilt.core import (
     Status,
     aspartial,
     bind,
+    check_flag,
     flag,
     is_concrete,
     number,
@@ -162,6 +163,8 @@ def joint_particle(
     if is_concrete(floor) and np.floor(float(floor) * count / s) < 1:
         raise ValueError(f"floor: {floor} of {count} particles leaves a class without any")
     check_share("threshold", threshold)
+    check_flag("score_gradient", score_gradient)
+    check_flag("keep", keep)
     transition_shape = (s, M, M) if real_array("transition", transition).ndim == 3 else (M, M)
     prior = (1 / s,) * s if prior is None else prior
     mode_prior = (1 / M,) * M if mode_prior is None else mode_prior

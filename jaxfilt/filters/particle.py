@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, check_callable, check_filter, flag
+from jaxfilt.core import Filter, Info, Prediction, Static, Status, bind, check_callable, check_filter, check_flag, flag
 from jaxfilt.filters.common import check_dtype, check_measurement, decoupled, likelihood, step_key
 from jaxfilt.filters.resampling import (
     SCHEMES,
@@ -134,6 +134,8 @@ def particle(
     for name, option, known in (("resampling", resampling, SCHEMES), ("gradient", gradient, GRADIENTS)):
         if option not in known:
             raise ValueError(f"{name}: expected one of {', '.join(known)}, got {option!r}")
+    check_flag("auxiliary", auxiliary)
+    check_flag("keep", keep)
     if auxiliary and guide is not None:
         raise ValueError("guide: not together with auxiliary, which is another way to look ahead")
     if auxiliary and gradient in ("soft", "transport"):

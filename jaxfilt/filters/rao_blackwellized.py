@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Info, Prediction, PyTree, Static, Status, bind, flag
+from jaxfilt.core import Filter, Info, Prediction, PyTree, Static, Status, bind, check_flag, flag
 from jaxfilt.filters.common import decoupled, likelihood, stack, step_key
 from jaxfilt.filters.imm import (
     _check_index,
@@ -128,6 +128,7 @@ def rao_blackwellized(
     _check_probabilities("transition", transition, (r, r))
     _check_probabilities("mu0", mu0, (r,))
     check_share("threshold", threshold)
+    check_flag("keep", keep)
     for name, option, known in (
         ("mixing", mixing, ("own", "zero")),
         ("proposal", proposal, ("optimal", "prior")),

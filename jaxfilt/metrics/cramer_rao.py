@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import PyTree, check_count, inputs
+from jaxfilt.core import PyTree, check_count, check_flag, inputs
 from jaxfilt.linalg import chol, solve_chol, solve_lower, sym, tria
 from jaxfilt.models.linear import LinearGaussian, check_covariance, check_finite, check_shape, common_dtype
 from jaxfilt.models.nonlinear import Nonlinear, as_nonlinear, covariance, jacobian
@@ -67,6 +67,7 @@ def posterior_bound(
     model = as_nonlinear(model)
     common_dtype({"states": states, "m0": model.m0, "P0": 0.0 if P0 is None else P0})
     check_finite("states", states)
+    check_flag("first_update_only", first_update_only)
     states = jnp.asarray(states, model.m0.dtype)
     states = states[None] if states.ndim == 2 else states
     n = model.m0.shape[0]
@@ -118,6 +119,7 @@ def start_bound(
     model = as_nonlinear(model)
     common_dtype({"x0": x0, "m0": model.m0, "prior": 0.0 if prior is None else prior})
     check_count("steps", steps, 1)
+    check_flag("first_update_only", first_update_only)
     check_finite("x0", x0)
     x0 = jnp.asarray(x0, model.m0.dtype)
     if x0.shape != model.m0.shape:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfilt.core import numbers
+from jaxfilt.core import check_flag, numbers
 
 
 class Estimate(NamedTuple):
@@ -59,6 +59,7 @@ def ratio(numerator: Any, denominator: Any, *, root: bool = False) -> Estimate:
     Raises:
         ValueError: different shapes.
     """
+    check_flag("root", root)
     a, b = _rows("numerator", numerator), _rows("denominator", denominator)
     if a.shape != b.shape:
         raise ValueError(f"denominator: expected the shape of numerator {a.shape}, got {b.shape}")

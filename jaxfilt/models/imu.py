@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import is_concrete, real_array
+from jaxfilt.core import check_flag, is_concrete, real_array
 from jaxfilt.models.linear import check_positive, common_dtype
 
 
@@ -53,6 +53,8 @@ def imu_inputs(
     if mask is not None and np.shape(mask) not in (np.shape(acc), np.shape(acc)[:-1]):
         raise ValueError(f"mask: expected shape {np.shape(acc)} or {np.shape(acc)[:-1]}, got {np.shape(mask)}")
     check_positive("gravity", gravity)
+    check_flag("at_rest", at_rest)
+    check_flag("gyr_hold", gyr_hold)
     if mask is not None and real_array("mask", mask).dtype != np.dtype(bool):
         raise TypeError(f"mask: expected bool, got {np.asarray(mask).dtype}")
     if is_concrete((gyr, acc, mask)):

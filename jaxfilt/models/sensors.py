@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxfilt.core import Static, aspartial, is_concrete
+from jaxfilt.core import Static, aspartial, check_flag, is_concrete
 from jaxfilt.models.linear import check_covariance, check_finite, check_positive, common_dtype
 from jaxfilt.models.nonlinear import Sensor
 
@@ -76,6 +76,7 @@ def bearing_doppler(
         ValueError: speed <= 0, a (concrete) R that is not positive definite, another doppler.
     """
     check_positive("speed", speed, scalar=True)
+    check_flag("compass", compass)
     if doppler not in ("first", "exact"):
         raise ValueError(f'doppler: expected "first" or "exact", got {doppler!r}')
     noise = _covariance(R, 2)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxfilt import metrics
-from jaxfilt.core import number
+from jaxfilt.core import check_flag, number
 from jaxfilt.plots import common
 
 
@@ -168,6 +168,7 @@ def monte_carlo(
     if len(lengths) > 1:
         raise ValueError(f"curves: expected one length T, got {sorted(lengths)}")
     t = common.abscissa(times, lengths.pop(), "curves")
+    check_flag("root", root)
     probability = number("probability", probability)
     if not 0 < probability < 1:
         raise ValueError(f"probability: expected a value in (0, 1), got {probability}")

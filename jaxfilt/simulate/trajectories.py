@@ -59,6 +59,7 @@ def simulate(
         TypeError: integer arrays or another float dtype than the model's.
     """
     check_linear(model)
+    core.check_flag("first_update_only", first_update_only)
     stacked = _inputs(T, model.m0.dtype, dt, u, key)
     if x0 is not None:
         x0 = _state("x0", x0, model, ())

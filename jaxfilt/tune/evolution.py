@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import aspartial, check_count, check_key, numbers
+from jaxfilt.core import aspartial, check_count, check_flag, check_key, numbers
 from jaxfilt.linalg import structure
 from jaxfilt.models.linear import check_finite
 from jaxfilt.progress import rounds
@@ -103,6 +103,7 @@ def _evolve(method, losses, space, data, key, weights, *, population, generation
     check_count("population", population, 2)
     check_count("generations", generations, 1)
     check_time_limit(time_limit)
+    check_flag("progress", progress)
     if spaces.size(space) == 0:
         raise ValueError("space: expected at least one spec, but every leaf is a plain value")
     pymoo = _pymoo()

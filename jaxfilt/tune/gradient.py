@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxfilt.core import aspartial, check_count, check_key, number
+from jaxfilt.core import aspartial, check_count, check_flag, check_key, number
 from jaxfilt.linalg import structure
 from jaxfilt.models.linear import check_finite
 from jaxfilt.progress import rounds
@@ -77,6 +77,7 @@ def gradient(
     spread = number("spread", spread)
     check_finite("spread", spread)
     check_time_limit(time_limit)
+    check_flag("progress", progress)
     optimizer = optax.with_extra_args_support(_ADAM if optimizer is None else optimizer)
     for name, count in (("steps", steps), ("starts", starts), ("block", block)):
         check_count(name, count, 1)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfilt.core import Filter, Prediction, Static, Status, StepInput, Wrapped, flag, present, wrap
+from jaxfilt.core import Filter, Prediction, Static, Status, StepInput, Wrapped, check_flag, flag, present, wrap
 from jaxfilt.filters.common import check_dtype, check_measurement
 from jaxfilt.models.linear import check_positive
 from jaxfilt.wrappers.common import predict_measurement
@@ -60,7 +60,8 @@ def phase_locked(filt: Filter, *, amplitude: Any = 1.0, normalize: bool = True, 
     """
     check_positive("amplitude", amplitude, scalar=True)
     check_positive("floor", floor, zero=True, scalar=True)
-    return wrap(_Params(filt, amplitude, floor, Static(bool(normalize))), init=_init, predict=_predict, update=_update)
+    check_flag("normalize", normalize)
+    return wrap(_Params(filt, amplitude, floor, Static(normalize)), init=_init, predict=_predict, update=_update)
 
 
 def _angle(inp: StepInput, y: Array, mask: Array | None) -> StepInput:

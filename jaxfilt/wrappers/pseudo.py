@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxfilt.core import Filter, Static, Status, Wrapped, aspartial, flag, multiply, present, wrap
+from jaxfilt.core import Filter, Static, Status, Wrapped, aspartial, check_flag, flag, multiply, present, wrap
 from jaxfilt.linalg import chol, solve_chol
 from jaxfilt.models.linear import check_positive
 from jaxfilt.wrappers.common import check_count, predict_measurement
@@ -104,7 +104,8 @@ def polynomial_fit(
     """
     max_age = 3 * window if max_age is None and isinstance(window, int) else max_age
     check_fit(window, degree, forgetting, max_age)
-    options = _Options(window, degree, bool(weighted), max_age)
+    check_flag("weighted", weighted)
+    options = _Options(window, degree, weighted, max_age)
     return wrap(
         _Polynomial(filt, forgetting, Static(options)),
         init=init_window,
@@ -151,7 +152,8 @@ def sinusoid_fit(
     if not callable(omega) and (isinstance(omega, bool) or not isinstance(omega, int)):
         raise TypeError(f"omega: expected an index of the state or a function of the mean, got {omega!r}")
     rate = aspartial(omega) if callable(omega) else Static(omega)
-    options = _Options(window, 1, bool(weighted), max_age)
+    check_flag("weighted", weighted)
+    options = _Options(window, 1, weighted, max_age)
     return wrap(
         _Sinusoid(filt, rate, interval, Static(options)),
         init=init_window,

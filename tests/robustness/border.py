@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -446,6 +447,13 @@ CALLS: dict[str, Callable[[], dict[str, Any]]] = {
 }  # fmt: skip
 
 
+def flags(function: Callable) -> dict[str, bool]:
+    """The options of a function that are True or False (or None), with a valid value; no case need name them."""
+    options = inspect.signature(function).parameters.values()
+    found = (p for p in options if isinstance(p.default, bool) or re.match(r"bool\b", str(p.annotation)))
+    return {p.name: p.default if isinstance(p.default, bool) else True for p in found}
+
+
 def Z3() -> np.ndarray:
     return np.zeros(3)
 
@@ -462,14 +470,15 @@ class Odd:
 
 
 def wrong(value: Any) -> Iterator[tuple[str, Any]]:
-    """``(kind, bad value)`` in the place of a valid one. A flag (bool) is whatever Python takes for true."""
-    if isinstance(value, bool):
-        return
+    """``(kind, bad value)`` in the place of a valid one."""
     yield "text", "no such"
     yield "object", Odd()
     if value is None:
         return
     yield "none", None
+    if isinstance(value, bool):
+        yield from (("number", 1), ("fraction", 0.5), ("array", np.array([True])))
+        return
     if isinstance(value, str):
         yield "number", 3
         return

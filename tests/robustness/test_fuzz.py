@@ -1,12 +1,13 @@
 """Bad values at the public border: an error of ours that names the argument, or an answer that can be trusted.
 
-One argument at a time of every call in :mod:`tests.robustness.border` is replaced by bad values. What must hold:
+One argument at a time of every call in :mod:`tests.robustness.border`, and every flag (True or False) that its function
+has, is replaced by bad values. What must hold:
 
 * Either a ValueError or TypeError is raised whose text has the argument's name; any other exception is a failure.
 * Or the call works. Of a wrong kind (text, an object, None without a default, complex numbers, a fraction for a count,
-  NaN in what a filter or model is built of) it must not. Integers and single precision must give what the same values
-  in double precision give; finite values nothing but finite values; NaN and infinity must show in the result or in its
-  status; what is built with another shape must run, or say the argument's name when it does.
+  a number for a flag, NaN in what a filter or model is built of) it must not. Integers and single precision must give
+  what the same values in double precision give; finite values nothing but finite values; NaN and infinity must show in
+  the result or in its status; what is built with another shape must run, or say the argument's name when it does.
 """
 
 from __future__ import annotations
@@ -148,10 +149,14 @@ def _verdict(name, arg, kind, bad, valid) -> str | None:
     return None if _finite(result) or not _finite(valid) or _flagged(result) else "is answered with NaN or infinity"
 
 
+def _arguments(name) -> dict[str, Any]:
+    return {**border.flags(PUBLIC[name]), **border.CALLS[name]()}
+
+
 def _bad_values(name, arg):
     default = inspect.signature(PUBLIC[name]).parameters
     optional = arg in default and default[arg].default is None
-    for kind, bad in border.wrong(border.CALLS[name]()[arg]):
+    for kind, bad in border.wrong(_arguments(name)[arg]):
         if not (bad is None and optional):
             yield kind, bad
 
@@ -175,7 +180,7 @@ def test_every_public_function_is_called_here_or_exempt_with_a_reason():
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in border.CALLS])
 def test_bad_values_are_refused_by_name_or_answered_rightly(name):
     failures = []
-    for arg in border.CALLS[name]():
+    for arg in _arguments(name):
         if (name, arg) not in KNOWN:
             failures += _failures(name, arg)
     assert not failures, "\n".join(failures)
