@@ -1,4 +1,4 @@
-"""What the status bits say as errors and warnings, and that each can occur and is carried on."""
+"""What the status bits say as errors and warnings; that each occurs and is carried on: test_status_bits.py."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import jaxfilt as jf
+from jaxfilt.chi2 import chi2_quantile
 from jaxfilt.cli import filters, text
 from jaxfilt.cli.learn import Learnt
 from jaxfilt.cli.read import Recording
@@ -88,7 +89,7 @@ def picture(path: str, rec: Recording, done: Run) -> None:
     """Track, positions over time, NIS and, of an IMM, the mode probabilities."""
     d, seen = len(rec.axes), rec.present
     panels = d + (done.out.nis is not None) + (done.modes is not None)
-    label = "smoothed" if isinstance(done.shown, jf.Smoothed) else "estimate"
+    label = _label(done)
     east, north = (np.ptp(np.asarray(done.shown.mean)[:, i]) for i in (0, min(1, d - 1)))
     wide = d > 1 and east > 1.2 * north  # then the track stands above the other panels, else beside them
     height = 1.5 + 8.5 * min(1.0, float(north / east)) if wide else 0.0
@@ -303,7 +304,7 @@ def _time_title(rec: Recording) -> str:
 def _ellipses(mean, cov, count) -> np.ndarray:
     """Outlines (.., 2) of 95 %, NaN between them."""
     angle = np.linspace(0, 2 * np.pi, 33)
-    circle = np.sqrt(jf.metrics.chi2_region(2, 1, 0.9)[1]) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    circle = np.sqrt(chi2_quantile(0.95, 2)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     parts = []
     for k in np.unique(np.linspace(0, len(mean) - 1, count).astype(int)):
         values, vectors = np.linalg.eigh(cov[k])

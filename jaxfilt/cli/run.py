@@ -121,12 +121,6 @@ def _sentence(found, share, count, correlation, bound) -> str:
     return text
 
 
-def status_counts(out: jf.Info) -> dict[str, int]:
-    """How many steps have each bit that occurred."""
-    words = np.asarray(out.status)
-    return {str(bit.name): int(((words & int(bit)) != 0).sum()) for bit in jf.Status if ((words & int(bit)) != 0).any()}
-
-
 def advice(out: jf.Info) -> list[str]:
     """What :func:`jaxfilt.check` says about the run."""
     with warnings.catch_warnings(record=True) as said:

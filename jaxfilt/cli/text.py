@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxfilt import describe
 from jaxfilt.cli import filters, run
 from jaxfilt.cli.filters import Choice
 from jaxfilt.cli.learn import Learnt
 from jaxfilt.cli.read import Recording
 from jaxfilt.cli.run import Run, Verdict
+from jaxfilt.core import Status
 
 
 def recording(rec: Recording) -> list[str]:
@@ -69,9 +71,8 @@ def judged(verdict: Verdict | None) -> list[str]:
 
 def statuses(done: Run) -> list[str]:
     """Status bits that occurred, and what to do."""
-    counts = run.status_counts(done.out)
-    listed = ", ".join(f"{name} {count}" for name, count in counts.items()) or "nothing to report"
-    return [f"status   {listed}"] + [f"warning  {text}" for text in run.advice(done.out)]
+    counts = describe.status_counts(np.asarray(done.out.status), Status) or "nothing to report"
+    return [f"status   {counts}"] + [f"warning  {text}" for text in run.advice(done.out)]
 
 
 def with_error(value: float, error: float, digits: int = 2) -> str:
